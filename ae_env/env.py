@@ -2,11 +2,13 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 
 from ae_env.episodes.core import (
     EpisodeCore,
@@ -22,7 +24,7 @@ from ae_env.episodes.state import Episode, Episodes, check_options
 from ae_env.first_frame import compile_beside
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
-from ae_env.registration import SpecProperty
+from ae_env.registration import InProcessSpec, is_json
 from ae_env.scenes import Scene
 from ae_env.scorers.captures import Captures, ShownScenes
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
@@ -306,7 +308,7 @@ class AutoExposure(Task):
         return {"speed": speed, "defocus": defocus, "movements": episodes.movements[env_indices]}
 
 
-class AutoExposureBase(SpecProperty):
+class AutoExposureBase:
     """The public surface that `AutoExposureEnv` and `AutoExposureVectorEnv` have in common.
 
     Policies and evaluations need nothing else of an environment.
@@ -316,6 +318,18 @@ class AutoExposureBase(SpecProperty):
     render_mode: str | None
     _make_task: MakeTask = AutoExposure
     _last: Frames | None
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Spec that Gymnasium made the environment from; None if it was constructed directly."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and not is_json(spec.kwargs):  # then it says why it is none
+            spec = InProcessSpec(**{f.name: getattr(spec, f.name) for f in fields(spec) if f.init})
+        self._spec = spec
 
     def _set_up(self, arguments: Mapping[str, Any], num_envs: int, render_mode: str | None) -> None:
         """Makes the core of `num_envs` episodes."""

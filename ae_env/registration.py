@@ -1,7 +1,6 @@
 """Registration with Gymnasium, and the parts of it that both environments need."""
 
 import json
-from dataclasses import fields
 from typing import Any
 
 import gymnasium as gym
@@ -34,7 +33,7 @@ class InProcessSpec(EnvSpec):
     def to_json(self) -> str:
         """Raises a `ValueError` that names the argument."""
         for name, value in self.kwargs.items():
-            if not _is_json(value):
+            if not is_json(value):
                 raise ValueError(
                     f"`{name}` (={value!r}) works in this process only and cannot be written as "
                     f"JSON: give its name instead, as in {name}='package.module:attribute'"
@@ -42,24 +41,8 @@ class InProcessSpec(EnvSpec):
         return super().to_json()
 
 
-class SpecProperty:
-    """Mixin for the environments: their ``spec`` says why it cannot become JSON."""
-
-    _spec: EnvSpec | None = None
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Spec that Gymnasium made the environment from; None if it was constructed directly."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        if spec is not None and not _is_json(spec.kwargs):
-            spec = InProcessSpec(**{f.name: getattr(spec, f.name) for f in fields(spec) if f.init})
-        self._spec = spec
-
-
-def _is_json(value: Any) -> bool:
+def is_json(value: Any) -> bool:
+    """Whether JSON can hold `value`."""
     try:
         json.dumps(value)
     except (TypeError, ValueError):
