@@ -55,28 +55,18 @@ _BLOCKS = (
 )
 
 
-class ConvNormReLU6(nn.Sequential):
+def _layer(inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1) -> nn.Module:
     """Convolution without bias, batch normalisation and ReLU6, padded as Keras' MobileNet is.
 
     With stride 2 only the right and the lower edge are padded, by one pixel.
     """
-
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1):
-        padding = (kernel - 1) // 2 if stride == 1 else 0
-        super().__init__(
-            nn.ZeroPad2d((0, 1, 0, 1)) if stride == 2 else nn.Identity(),
-            nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False),
-            nn.BatchNorm2d(outputs, eps=_EPS),
-            nn.ReLU6(),
-        )
-
-    def fuse(self) -> None:
-        """Takes the normalisation into the convolution, for inference only."""
-        convolution, normalisation = self[1], self[2]
-        assert isinstance(convolution, nn.Conv2d)
-        assert isinstance(normalisation, nn.BatchNorm2d)
-        self[1] = fuse_conv_bn_eval(convolution, normalisation)
-        self[2] = nn.Identity()
+    padding = (kernel - 1) // 2 if stride == 1 else 0
+    return nn.Sequential(
+        nn.ZeroPad2d((0, 1, 0, 1)) if stride == 2 else nn.Identity(),
+        nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False),
+        nn.BatchNorm2d(outputs, eps=_EPS),
+        nn.ReLU6(),
+    )
 
 
 class NimaMobileNet(nn.Module):
@@ -89,11 +79,11 @@ class NimaMobileNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        layers: list[nn.Module] = [ConvNormReLU6(3, 32, 3, 2)]
+        layers = [_layer(3, 32, 3, 2)]
         inputs = 32
         for outputs, stride in _BLOCKS:
-            layers.append(ConvNormReLU6(inputs, inputs, 3, stride, groups=inputs))
-            layers.append(ConvNormReLU6(inputs, outputs, 1, 1))
+            layers.append(_layer(inputs, inputs, 3, stride, groups=inputs))
+            layers.append(_layer(inputs, outputs, 1, 1))
             inputs = outputs
         self.features = nn.Sequential(*layers)
         self.head = nn.Linear(inputs, RATINGS)
@@ -124,9 +114,9 @@ def read_network(file: str | os.PathLike[str]) -> NimaMobileNet:
         rule = "must be weights of NIMA's MobileNet in .safetensors"
         raise ValueError(f"`file` (={str(file)!r}) {rule}: {error}") from error
     network.eval().requires_grad_(False)
-    for layer in network.features:
-        assert isinstance(layer, ConvNormReLU6)
-        layer.fuse()
+    layer: Any
+    for layer in network.features:  # the normalisation goes into the convolution
+        layer[1], layer[2] = fuse_conv_bn_eval(layer[1], layer[2]), nn.Identity()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network
 
