@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from simulator.capture.statistics import Residual
 from simulator.networks.unet import UNet, padded
 from simulator.noise.generator import frame_normals, noise_keys
+from simulator.raw.develop import window_means
 from simulator.utils.checks import check_word
 
 Preset = Literal["nano", "compact", "large", "paper", "ncs"]
@@ -189,11 +190,8 @@ def _coarse_mean(x: Tensor, cells: int) -> Tensor:
 
     Only cells of the frame count: at its borders the window is smaller.
     """
-    pooled = F.avg_pool2d(x, _CELL)
-    for window in ((cells, 1), (1, cells)):
-        padding = (window[0] // 2, window[1] // 2)
-        pooled = F.avg_pool2d(pooled, window, 1, padding, count_include_pad=False)
-    return F.interpolate(pooled, x.shape[-2:], mode="bilinear", align_corners=False)
+    means = window_means(F.avg_pool2d(x, _CELL), cells)
+    return F.interpolate(means, x.shape[-2:], mode="bilinear", align_corners=False)
 
 
 class ResidualBlock(nn.Module):

@@ -408,9 +408,9 @@ def _above_white(data: torch.Tensor, clipped: torch.Tensor) -> torch.Tensor:
     """Light (H, W) of wholly `clipped` pixels over white, see `_ABOVE_WHITE`."""
     (dark, amid, both), (close, wide) = _ABOVE_WHITE, _AMID_PX
     measured = (1.0 - data.clamp(0.0, 1.0).mean(dim=0)).masked_fill(clipped, 0.0)
-    below, share = _around(torch.stack([measured, clipped.float()]), close)
+    below, share = window_means(torch.stack([measured, clipped.float()]), close)
     below = below / (1.0 - share).clamp(min=0.5 / close**2)
-    return 1.0 + below * (dark + amid * share) + both * _around(clipped[None], wide)[0] ** 4
+    return 1.0 + below * (dark + amid * share) + both * window_means(clipped[None], wide)[0] ** 4
 
 
 def _clipped_by_noise(
@@ -442,8 +442,8 @@ def _told_by_neighbours(
     for side, apart in _QUARTERS:
         if not bool(unseen.any()):
             break
-        at_white, below = _around(full, side + 2 * apart), _around(near, side + 2 * apart)
-        quarters = F.pad(_around(near, side), (apart,) * 4, mode="replicate")
+        at_white, below = window_means(full, side + 2 * apart), window_means(near, side + 2 * apart)
+        quarters = F.pad(window_means(near, side), (apart,) * 4, mode="replicate")
         least = -F.max_pool2d(-quarters, 2, 1, dilation=2 * apart)  # of the four
         others, enough = 1.0 - at_white - below, (least * side**2 / _ENOUGH).clamp(max=1.0)
         better = unseen & (enough > trust) & (others < below)
@@ -455,10 +455,10 @@ def _told_by_neighbours(
     return light, trust
 
 
-def _around(marks: torch.Tensor, side: int) -> torch.Tensor:
-    """Share of `marks` (C, H, W) in the window of `side` pixels around each pixel."""
-    shares = marks.float()
+def window_means(values: torch.Tensor, side: int) -> torch.Tensor:
+    """Means of (..., C, H, W) over the frame's pixels in the window of `side` around each pixel."""
+    means = values.float()
     for window in ((side, 1), (1, side)):
         padding = (window[0] // 2, window[1] // 2)
-        shares = F.avg_pool2d(shares, window, 1, padding, count_include_pad=False)
-    return shares
+        means = F.avg_pool2d(means, window, 1, padding, count_include_pad=False)
+    return means
