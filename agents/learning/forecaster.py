@@ -296,5 +296,5 @@ def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
         taken_at = exposed_at[:, t]
         reading = mean_reading(mean[:, t], saturated[:, t], taken_at)
         read.append(matcher.match(reading, shown[:, t], taken_at))
-    columns = zip(*((one.ev100, one.saturated, one.black) for one in read), strict=True)
+    columns = zip(*read, strict=True)
     return Reading(*(np.stack(column, axis=1) for column in columns)), exposed_at

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +46,7 @@ _SHOWN = (0.004, 0.9)
 _SATURATED = 0.01
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """A meter's result for one frame of each camera: metered EV100, ``(N,)``.
 
     Of the metered weight a share is `saturated`: the reading is a lower bound in so far. Where the
@@ -175,7 +173,7 @@ def read_part(
 ) -> Reading:
     """The reading of a part of each frame: the box around it is the meter's frame."""
     found = [meter(cut, estimate[cameras]) for cameras, cut in parts_of(observations, masks)]
-    return Reading(*map(np.concatenate, zip(*(vars(one).values() for one in found), strict=True)))
+    return Reading(*map(np.concatenate, zip(*found, strict=True)))
 
 
 def inside(observations: Observations) -> NDArray[Any]:
