@@ -30,14 +30,8 @@ from simulator.utils.files import read_bounded
 
 # -- tuning files ---------------------------------------------------------------------------------
 
-#: Share of the distance to the target that the filter goes per frame, and frames of the start, in
-#: which it goes all of the way.
-SPEED, STARTUP_FRAMES = 0.2, 10
-#: Within these of the target the filter goes with the square root of its speed, and stays.
-NEAR, STABLE = 0.2, 0.02
-#: A target above this that the picture exceeds is approached from below, at this part of the
-#: exposure.
-FAST_REDUCE = 0.4
+#: Within this of the target the filter goes with the square root of its speed.
+NEAR = 0.2
 #: Zones a side on the Pi 5.
 PISP_SIDE = 15
 
@@ -102,11 +96,15 @@ class Tuning(BaseModel, frozen=True):
     exposure_modes: dict[_Name, Annotated[Ladder, AfterValidator(_in_seconds)]]
     constraint_modes: dict[_Name, list[Constraint]] = Field(min_length=1)
     y_target: _Target
-    speed: float = Field(SPEED, gt=0.0, le=1.0)
-    startup_frames: int = Field(STARTUP_FRAMES, ge=0)
+    #: Share of the distance to the target that the filter goes per frame, and frames of the start,
+    #: in which it goes all of the way.
+    speed: float = Field(0.2, gt=0.0, le=1.0)
+    startup_frames: int = Field(10, ge=0)
     base_ev: float = Field(1.0, gt=0.0, lt=np.inf)  # factor of all targets
-    stable_region: _Share = STABLE
-    fast_reduce_threshold: _Share = FAST_REDUCE
+    stable_region: _Share = 0.02  # within this of the target the filter stays
+    #: A target above this that the picture exceeds is approached from below, at this part of the
+    #: exposure.
+    fast_reduce_threshold: _Share = 0.4
 
 
 _TOP = Constraint("LOWER", 0.98, 1.0, [0.0, 0.3])
@@ -283,9 +281,7 @@ def zone_factor(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
 def signal_histogram(signals: NDArray[Any]) -> Floats:
     """``(N, HISTOGRAM_BINS)`` counts of `signals` ``(N, P)`` in bins from 0 to 1."""
     bins = np.clip(signals * HISTOGRAM_BINS, 0, HISTOGRAM_BINS - 1).astype(np.int64)
-    rows = np.arange(len(bins))[:, None] * HISTOGRAM_BINS
-    counts = np.bincount((bins + rows).ravel(), minlength=len(bins) * HISTOGRAM_BINS)
-    return counts.reshape(len(bins), HISTOGRAM_BINS).astype(np.float64)
+    return np.array([np.bincount(row, minlength=HISTOGRAM_BINS) for row in bins], np.float64)
 
 
 def inter_quantile_mean(histogram: Floats, low: float, high: float) -> Floats:
