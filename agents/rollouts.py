@@ -19,11 +19,9 @@ from agents.policy import Bools, Floats, Ints, Observations, Policy, VectorEnv
 ENV_ID = "ae_env:ae_env/AutoExposure-v0"
 
 
-def make_envs(
-    env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
-) -> VectorEnv:
+def make_envs(env_options: Mapping[str, Any], *, num_envs: int, frames: int) -> VectorEnv:
     """Environments of the arguments `env_options`, without autoreset, for `frames` actions."""
-    shown = {"with_oracle": with_oracle, "with_subject": True}
+    shown = {"with_oracle": False, "with_subject": True}
     options = {**env_options, **shown, "autoreset_mode": "DISABLED"}
     # One frame more than is used: the episode must not end inside the evaluation.
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
