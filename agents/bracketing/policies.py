@@ -52,16 +52,16 @@ class Schedules:
     def __init__(self, grid: ExposureGrid, camera: CameraProfile, limits: BracketLimits) -> None:
         self.grid, self.limits = grid, limits
         budget, max_frames, box_factor = limits
-        self._exposures = exposures = np.array([s.exposure_time for s in grid])
+        self.exposure_times = times = np.array([s.exposure_time for s in grid])
         found = [(-1,) * max_frames]
         for count in range(1, max_frames + 1):
             for chosen in itertools.combinations_with_replacement(range(len(grid)), count):
-                if exposures[list(chosen)].sum() + FRAME_GAP * (count - 1) <= budget + _SLACK:
+                if times[list(chosen)].sum() + FRAME_GAP * (count - 1) <= budget + _SLACK:
                     found.append((*chosen, *(-1,) * (max_frames - count)))
         self.states = np.array(found)
         self.counts = np.stack([(self.states == s).sum(axis=1) for s in range(len(grid))], axis=1)
         self.frames = (self.states >= 0).sum(axis=1)
-        self.longest = np.where(self.counts > 0, exposures, 0.0).max(axis=1)
+        self.longest = np.where(self.counts > 0, times, 0.0).max(axis=1)
         nlfs = [nlf.scaled(1.0 / box_factor**2) for nlf in camera.nlfs(grid)]
         self.shot = np.array([np.mean(n.shot) for n in nlfs])
         self.read = np.array([np.mean(n.read) for n in nlfs])
@@ -114,15 +114,15 @@ class Schedules:
         """(M,) bool: schedules that hold the states `taken` and fit into the `time_left` [s]."""
         counts = np.bincount(taken, minlength=len(self.grid)) if len(taken) else 0
         more = self.frames - len(taken)
-        needed = (self.counts - counts) @ self._exposures + FRAME_GAP * np.maximum(more - 1, 0)
+        needed = (self.counts - counts) @ self.exposure_times + FRAME_GAP * np.maximum(more - 1, 0)
         return np.asarray((self.counts >= counts).all(axis=1) & (needed <= time_left + _SLACK))
 
     def next_state(self, schedule: int, taken: Ints, alone: Floats) -> int:
-        """The next state of `schedule`, of the least error `alone` (S,); -1 when all are taken."""
+        """The next state of `schedule`, of the least error `alone` (S,); S when all are taken."""
         left = self.counts[schedule].copy()
         np.subtract.at(left, taken, 1)
         wanted = np.flatnonzero(left > 0)
-        return int(wanted[np.argmin(alone[wanted])]) if len(wanted) else -1
+        return int(wanted[np.argmin(alone[wanted])]) if len(wanted) else len(alone)
 
 
 #: log2 of the luminance below which errors count less, from the EV100 of the viewfinder's frame.
@@ -240,8 +240,7 @@ class FixedBracket(Bracketing):
 
     def _plan(self, wanted: Floats) -> Ints:
         """States within half a stop of the EV100 `wanted`, at the lowest ISO, that fit."""
-        grid = self.context.grid
-        times = np.array([s.exposure_time for s in grid])
+        grid, times = self.context.grid, self.schedules.exposure_times
         off = (2.0 * np.abs(grid.ev100 - wanted[:, None])).round()
         off += 1e-3 * np.log2([s.iso for s in grid])
         for longest in reversed(grid.exposure_times):
@@ -312,8 +311,7 @@ class Hasinoff(Bracketing):
             fits &= self.schedules.longest <= self.longest * (1.0 + 1e-6)
             self._plans[camera] = int(np.where(fits, worst, -1.0).argmax())
         plan = self._plans[camera]
-        state = self.schedules.next_state(plan, taken, np.abs(self.context.grid.ev100 - reference))
-        return self.stop if state < 0 else state
+        return self.schedules.next_state(plan, taken, np.abs(self.context.grid.ev100 - reference))
 
     def _range(self, camera: int) -> tuple[float, float]:
         """log2 of the least and the most luminance."""
@@ -350,19 +348,18 @@ class Planner(Bracketing):
         super().__init__(context)
         check_flag("blur", blur)
         self.name, self.blur = "bracket" if blur else "bracket:planned", blur
-        self._times = np.array([s.exposure_time for s in context.grid])
 
     def choose(self, camera: int, time_left: float, speed: float) -> int:
         """The next state, or to stop where no further frame helps."""
         reference, taken = float(self._reference[camera]), self.taken(camera)
-        blur = blur_error(64.0 * speed * self._times) if self.blur else np.zeros(self.stop)
+        pixels = 64.0 * speed * self.schedules.exposure_times
+        blur = blur_error(pixels) if self.blur else np.zeros(self.stop)
         errors = self.schedules.errors(reference, reference + _FLOOR, self.light(camera), blur)
         best = int(np.where(self.schedules.completions(taken, time_left), errors, np.inf).argmin())
         alone = np.full(self.stop, np.inf)  # error of single frames; inf where none fits
         single = np.flatnonzero(self.schedules.frames == 1)
         alone[self.schedules.states[single, 0]] = errors[single]
-        state = self.schedules.next_state(best, taken, alone)
-        return self.stop if state < 0 else state
+        return self.schedules.next_state(best, taken, alone)
 
     def light(self, camera: int) -> Floats:
         """(L,) shares of the samples in `BINS`, as the frames so far show them."""
