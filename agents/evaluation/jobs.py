@@ -287,8 +287,7 @@ def named_content(name: str) -> str:
         with file.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             found.update(f"{printable(file.name)}\0{size}\0".encode())
-            while piece := stream.read(2**20):
-                found.update(piece)
+            hashlib.file_digest(stream, lambda: found)
     return found.hexdigest() if files else ""
 
 

@@ -197,7 +197,6 @@ class StateHead(nn.Module):
         grid: The states.
         features: Size of the features that describe the frame.
         outputs: Values per state.
-        width: Hidden units.
         trained_on: Grid that the weights come from, on whose scale states enter; default: `grid`.
     """
 
@@ -207,30 +206,26 @@ class StateHead(nn.Module):
         features: int,
         has_sensors: bool,
         outputs: int = 1,
-        width: int = 64,
         trained_on: ExposureGrid | None = None,
     ) -> None:
         super().__init__()
         self.has_sensors = has_sensors
         table = _apex_table(grid)
         known = table if trained_on is None else _apex_table(trained_on)
+        self.table: torch.Tensor
         self.states: torch.Tensor
-        self.log2_time: torch.Tensor
-        self.log2_opening: torch.Tensor
         spread = known.std(dim=0) if len(known) > 1 else torch.ones(known.shape[1])
         normalised = (table - known.mean(dim=0)) / spread.clamp(min=1.0)
         self.register_buffer("states", normalised, persistent=False)
-        self.register_buffer("log2_time", -table[:, 2], persistent=False)
-        self.register_buffer("log2_opening", 2.0 - 0.5 * table[:, 1], persistent=False)
+        self.register_buffer("table", table, persistent=False)
         over = (_BINS[:, None, None] - table[:, :1] - _LEVELS) / _SOFTNESS  # (bins, S, levels)
         self.exposed: torch.Tensor
         self.register_buffer("exposed", torch.sigmoid(over), persistent=False)
+        width = 64  # hidden units
         self.from_features = nn.Linear(features, width)
         self.from_light = nn.Linear(_HISTOGRAMS * len(_LEVELS) + 2, width, bias=False)
-        self.ev100: torch.Tensor
         self.luminance: torch.Tensor
         self.likely: torch.Tensor
-        self.register_buffer("ev100", table[:, :1], persistent=False)
         self.register_buffer("luminance", torch.exp2(_BINS), persistent=False)
         self.register_buffer("likely", _LIKELY / _LIKELY[:, 1:].sum(), persistent=False)
         self.right = nn.Linear(features, 2)
@@ -254,7 +249,7 @@ class StateHead(nn.Module):
     ) -> torch.Tensor:
         """Values (B, S, outputs), from what `ExposureFeatures` says of the frame."""
         mean, spread = self.right_ev100(features, light)
-        wrong = mean[:, None, None] - self.ev100  # (B, S, 1)
+        wrong = mean[:, None, None] - self.table[:, :1]  # (B, S, 1)
         likely = wrong + spread[:, None, None] * self.likely[0]
         brightness = torch.exp(1.0 - torch.sqrt(1.0 + likely.square())) @ self.likely[1]
         exposure = torch.stack([brightness, torch.tanh(wrong[..., 0] / 3.0)], dim=2)
@@ -273,8 +268,8 @@ class StateHead(nn.Module):
         low, high = SENSOR_RANGES[:, 0], SENSOR_RANGES[:, 1]
         speed = low[0] + (sensors[:, :1] + 1.0) * 0.5 * (high[0] - low[0])
         defocus = low[1] + (sensors[:, 1:] + 1.0) * 0.5 * (high[1] - low[1])
-        motion_px = torch.exp2(speed + 6.0 + self.log2_time)  # (B, S): 64 pixels a frame height
-        defocus_px = torch.exp2(defocus + self.log2_opening)
+        motion_px = torch.exp2(speed + 6.0 - self.table[:, 2])  # (B, S): 64 pixels a frame height
+        defocus_px = torch.exp2(defocus + (2.0 - 0.5 * self.table[:, 1]))
         squared = motion_px.square() + defocus_px.square()
         return torch.stack([squared.log2() / 8.0, torch.log1p(squared) / 2.0], dim=2)
 

@@ -228,7 +228,7 @@ class Page:
                 with button:
                     ui.element("img").props(f'alt="" loading=lazy src={self._thumbnail(name)}')
                     ui.label(name)
-                button.on("click", lambda name=name: self._pick(name))
+                button.on("click", partial(self.open, name))
 
     def _thumbnail(self, name: str) -> str:
         """Address of the thumbnail of the scene called `name`."""
@@ -240,12 +240,9 @@ class Page:
             key, lambda: options.viewed(library, name).thumbnail()
         )
 
-    async def _pick(self, name: str) -> None:
-        self._picker.close()
-        await self.open(name)
-
     async def open(self, name: str, settings: CameraSettings | None = None) -> None:
         """Shows the scene called `name` on all tabs, at `settings` or at its best state."""
+        self._picker.close()
         title, self._title.text = self._title.text, f"{name} ..."
         before = self._exposure.view.settings
         try:
