@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, PositiveInt, ValidationError
 
 from simulator.utils.checks import check_flag, check_integer, check_number, onnx_session
 from simulator.utils.files import as_path, read_bounded
@@ -49,18 +49,14 @@ Range = Annotated[tuple[Exponent, Exponent], AfterValidator(_rising)]
 States = list[tuple[Positive, Positive, Positive]]
 
 
-class _Entries(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
-
-
-class Ranges(_Entries):
+class Ranges(BaseModel, extra="forbid", allow_inf_nan=False, strict=True):
     """Values that are -1 and 1 to the network, in powers of two."""
 
     settings: tuple[Range, Range, Range]
     sensors: tuple[Range, Range]
 
 
-class Card(_Entries):
+class Card(BaseModel, extra="forbid", allow_inf_nan=False, strict=True):
     """What an exported file says about its agent: the network, and how a camera's frames go in."""
 
     format: Literal[1]
