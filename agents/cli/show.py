@@ -136,7 +136,6 @@ def film(
     """
     import gymnasium as gym
 
-    import ae_env  # noqa: F401  (registers the environment)
     from ae_env.lighting.moving import KIND_SETS, MOVES
     from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
@@ -228,7 +227,6 @@ def lightings() -> None:
     """
     from dataclasses import fields
 
-    import ae_env.lighting  # noqa: F401  (defines them)
     from ae_env.lighting.base import KINDS
 
     rows = []

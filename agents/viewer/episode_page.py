@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 from nicegui import ui
 
-import ae_env  # noqa: F401  (registers the environments)
 from ae_env.grid import ExposureGrid
 from ae_env.lighting.moving import KIND_SETS, MOVES
 from ae_env.scenes import Scene
