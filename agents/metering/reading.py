@@ -43,7 +43,7 @@ _QUANTILES = np.linspace(0.05, 0.95, 19)
 _TOLERANCE, _TOLERANCE_EV = 0.04, 0.3
 _SHOWN = (0.004, 0.9)
 #: Saturated share from which a frame hides something.
-_SATURATED = 0.01
+SATURATED_SEEN = 0.01
 
 
 class Reading(NamedTuple):
@@ -261,7 +261,7 @@ class ReferenceFrames:
             self._best = (raw.copy(), settings.copy(), quantiles, saturated, ev)
         else:
             _, _, _, known_saturated, known_ev = self._best
-            hides, hid = saturated >= _SATURATED, known_saturated >= _SATURATED
+            hides, hid = saturated >= SATURATED_SEEN, known_saturated >= SATURATED_SEEN
             # The same state again is a newer look at the same light.
             better = np.where(hides | hid, saturated < known_saturated, ev <= known_ev)
             replaced = better | self._changed(quantiles, ev)

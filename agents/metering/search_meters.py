@@ -23,6 +23,7 @@ from agents.metering.reading import (
     CODE_SIGNALS,
     CODES,
     GREEN,
+    SATURATED_SEEN,
     SATURATED_STEP_EV,
     TARGET_SIGNAL,
     WHITE_SIGNAL,
@@ -52,8 +53,6 @@ ZHANG_RATE, ZHANG_LIMIT_EV, ZHANG_DELTA_EV = 3.0, 2.0, 0.25
 #: How often a step that lowers the metric is halved before it is given up; and by how many EV the
 #: frame in hand is exposed again at most.
 HALVINGS, SIMULATED_EV = 4, 4.0
-#: Saturated share from which a frame hides something.
-SATURATED_SEEN = 0.01
 #: From a saturated share s of 0.1 on, a frame is too bright by 4 (s - 0.1) EV or more.
 SATURATED_LIMIT, SATURATED_SLOPE_EV = 0.1, 4.0
 #: A frame without a gradient that is so far below the target is exposed for it, in steps of at

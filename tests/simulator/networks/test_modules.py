@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import get_camera
@@ -189,15 +191,13 @@ NLF = get_camera("nikon_z6").nlf(6400)
 SHOT, READ = torch.tensor([NLF.shot]), torch.tensor([NLF.read])
 
 
-def test_operations_by_hand() -> None:
-    """Two per weight and place; a level has a quarter of the places of the one before."""
-    convolutions = [(1, 9, 16, 16), (1, 9, 16, 4)]  # head and tail
-    convolutions += 4 * [(1, 9, 16, 16)] + 4 * [(4, 9, 24, 24)] + 4 * [(16, 9, 32, 32)]  # blocks
-    convolutions += [(4, 4, 16, 24), (16, 4, 24, 32)]  # down: 2 x 2, to a quarter of the places
-    convolutions += [(1, 1, 24, 16), (4, 1, 32, 24)]  # up: each place has one weight of 2 x 2
-    expected = sum(2 * taps * wide * out / places for places, taps, wide, out in convolutions)
-    assert NoiseModule("nano").operations == round(expected) == 41_472
-    assert not NoiseModule("paper").commutes
+@pytest.mark.parametrize("preset", get_args(noise_module.Preset))
+def test_operations_are_those_that_torch_counts(preset: noise_module.Preset) -> None:
+    module = NoiseModule(preset).eval()
+    with torch.no_grad(), FlopCounterMode(display=False) as counted:
+        module(torch.full((1, 4, 32, 32), 0.1), SHOT, READ)
+    assert module.operations == counted.get_total_flops() / 32**2
+    assert module.commutes == (preset in SIZES)
 
 
 @pytest.mark.parametrize("preset", ["nano", "paper"])

@@ -166,12 +166,8 @@ def counted(simulator: CameraSimulator) -> list[int]:
     runs: list[int] = []
     networks = simulator.noise.network.tail, simulator.aperture.network
 
-    def count(_module, _inputs, output):
-        if output.shape[-2:] != (32, 32):  # there operations are counted
-            runs.append(1)
-
     for network in networks:
-        network.register_forward_hook(count)
+        network.register_forward_hook(lambda *_: runs.append(1))
     return runs
 
 
