@@ -22,8 +22,8 @@ from simulator.utils.config_file import Configuration, load_yaml
 
 #: Where an episode may begin; see `start_state`.
 STARTS = ("dark", "middle", "bright", "random")
-#: Names of parts of the static condition, which no condition may have.
-_RESERVED = ("all", "hard", "rest")
+#: Parts of the static condition, whose names no condition may have.
+PARTS = ("all", "hard", "rest")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+./-]*")
 MAX_SEED, MAX_SCENES = 2**32 - 1, 100_000
 #: Seeds of two entries of a plan's `seeds` are this far apart: more than any plan has scenes.
@@ -120,10 +120,10 @@ class EvaluationPlan(Configuration):
         for seed in self.seeds:
             check_integer("seeds", seed, 0, MAX_SEED)
         for name, condition in self.conditions.items():
-            if not _NAME.fullmatch(name) or name in _RESERVED or condition.budget is not None:
+            if not _NAME.fullmatch(name) or name in PARTS or condition.budget is not None:
                 raise ValueError(
                     f"`conditions` (={name!r}): a name must be of letters, digits and _+./-, and "
-                    f"none of {list(_RESERVED)}; and none has a `budget`"
+                    f"none of {list(PARTS)}; and none has a `budget`"
                 )
         for name in (*CONDITION_ARGUMENTS, *_SET_BY_EVALUATION):
             if name in self.environment:

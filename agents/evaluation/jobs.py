@@ -108,16 +108,15 @@ class Jobs(engine.EvaluationRun):
             raise ValueError("`policies` (=[]) must hold at least one policy")
         engine.check_scorers(self.plan.other_scorers)
         privileged = self.privileged
-        jobs = self._left()
+        jobs, shown = self._left(), progress or (lambda *_: None)
         total = max(sum(job.cost for job in jobs), 1.0)
         done = 0.0
 
         def report(job: Job, cost: float) -> None:
             nonlocal done
             done += cost
-            if progress is not None:
-                label = f"light: {job.conditions[0]}" if job.trained is None else job.trained.name
-                progress(int(min(done, total)), int(total), label)
+            label = f"light: {job.conditions[0]}" if job.trained is None else job.trained.name
+            shown(int(min(done, total)), int(total), label)
 
         if workers is None:
             workers = core_count() if total > _SMALL_MS else 1
@@ -130,8 +129,7 @@ class Jobs(engine.EvaluationRun):
             first = []
         for job in (*first, *last):
             self.do(job, partial(report, job))
-        if progress is not None:
-            progress(int(total), int(total), "")
+        shown(int(total), int(total), "")
         conditions, static = self.plan.all_conditions, self.plan.static_condition
         results = {name: self._finished(condition) for name, condition in conditions.items()}
         if self.plan.other_scorers:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from agents.evaluation import intervals, metrics
-from agents.evaluation.evaluation_plan import EvaluationPlan
+from agents.evaluation.evaluation_plan import PARTS, EvaluationPlan
 from agents.policy import Bools, Floats, Ints
 from agents.policy_names import is_metering
 from simulator.optics.motion import Movement
@@ -21,8 +21,6 @@ from simulator.utils.checks import check_word
 #: By condition.
 Results = Mapping[str, "EvaluationResult"]
 
-#: Parts of the static condition.
-PARTS = ("all", "hard", "rest")
 #: Columns of `results.json`, in its order, and those that `metrics.csv` has besides.
 ROW_COLUMNS = (
     *("policy", "condition", "source", "split", "num_groups", "seed", "mean_score"),

@@ -179,11 +179,6 @@ def _spread(shares: torch.Tensor, luminance: torch.Tensor) -> torch.Tensor:
     return bins.scatter_add(1, below + 1, shares * weight)
 
 
-def _apex_table(grid: ExposureGrid) -> torch.Tensor:
-    """EV100, Av, Tv and Sv of every state, (S, 4)."""
-    return torch.from_numpy(np.column_stack([grid.ev100, grid.apex])).float()
-
-
 class StateHead(nn.Module):
     """Values of every exposure state, by one small network that all states share.
 
@@ -210,8 +205,8 @@ class StateHead(nn.Module):
     ) -> None:
         super().__init__()
         self.has_sensors = has_sensors
-        table = _apex_table(grid)
-        known = table if trained_on is None else _apex_table(trained_on)
+        grids = grid, trained_on or grid  # EV100, Av, Tv and Sv of every state, (S, 4):
+        table, known = (torch.from_numpy(np.column_stack([g.ev100, g.apex])).float() for g in grids)
         self.table: torch.Tensor
         self.states: torch.Tensor
         spread = known.std(dim=0) if len(known) > 1 else torch.ones(known.shape[1])
