@@ -262,6 +262,7 @@ def _use_rest() -> None:
     from simulator.capture.blurred_frames import BLUR, BlurredFrames
     from simulator.capture.blurred_light import MapApertureBlur
     from simulator.capture.prepared_scene import PreparedScene
+    from simulator.capture.statistics import DenoisedLight, Residual
     from simulator.noise.generator import frame_normals
     from simulator.optics.discs import disc_blur
     from simulator.optics.motion import motion_blur
@@ -279,10 +280,12 @@ def _use_rest() -> None:
     disc_blur(motion_blur(light, 2.5), 2.5)
     frame_normals(0, (1, 1, 1))
     noise = raw.camera.nlf(raw.settings.iso)
-    scene = PreparedScene(light, raw.settings, raw.camera, noise, tolerance=0.0)
+    scene = PreparedScene(light, raw.settings, raw.camera, noise)
     scene.expose([raw.settings] * 2)
     opens = MapApertureBlur(light, torch.ones(light.shape[1:]), 32.0)
-    replace(scene, aperture_blur=opens).plan(raw.settings)
+    networks = (DenoisedLight(light, residual=Residual.alike(0.1)),)
+    whole = replace(scene, aperture_blur=opens, denoised_lights=networks, tolerance=0.0)
+    whole.plan(replace(raw.settings, iso=raw.settings.iso / 8.0, exposure_time=1.0))
     vignetting = np.ones(light.shape[1:], np.float32)
     blurs = np.array([(0.0, 2.5, True, *[0] * 10, vignetting.ctypes.data)], BLUR)
     first = np.zeros(1, np.int64)
