@@ -26,7 +26,7 @@ from simulator.utils import compute
 
 STEPS, ROUNDS = 40, 9
 CALLERS = {
-    "_plan": "plans of large batches",
+    "_plan_rows": "plans of large batches",
     "_photograph": "blur, frames, sums of codes",
     "blur": "sharpness of each capture",
     "_record_fused": "frames, sums of codes",
@@ -43,7 +43,7 @@ def timed_sections(spent):
         try:
             original(task, count, **options)
         finally:
-            if name != "_plan" or count >= 2 * options["least"]:  # else one thread has it all
+            if name != "_plan_rows" or count >= 2 * options["least"]:  # else one thread has it all
                 spent[name] += time.perf_counter() - begun
 
     for module in list(sys.modules.values()):
