@@ -125,10 +125,8 @@ def noise_column(scene: PreparedScene, *, errors: bool) -> np.ndarray:
     found = np.zeros((), NOISE)
     if scene.nlf.is_zero:
         return found
-    found["source"], found["bins"] = (
-        (scene.nlf.shot, scene.nlf.read),
-        scene.statistics.noise_columns,
-    )
+    found["source"] = scene.nlf.shot, scene.nlf.read
+    found["bins"] = scene.statistics.noise_columns
     found["noisy"], found["networks"] = True, len(scene.denoised_lights)
     blur = scene.aperture_blur
     if blur is not None:
@@ -389,8 +387,9 @@ def plan_sweep(
         `Exposure.remaining_variance`, None in place of all where the source has no noise.
     """
     # One state alone is decided on in less time than it takes to call a kernel.
-    columns = state_columns(scene.camera, states)
-    inside = len(states) > 1 and scene.defocus <= widest_defocus(scene, columns)
+    inside = len(states) > 1 and scene.defocus <= widest_defocus(
+        scene, columns := state_columns(scene.camera, states)
+    )
     if not inside or len(scene.denoised_lights) > NETWORKS:
         pairs = zip(states, gains.tolist(), strict=True)
         exposures = [decision.decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
