@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simulator.capture.decision import PEDESTAL as PEDESTAL
+from simulator.capture.limits import PEDESTAL as PEDESTAL
 from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from ae_env.scenes.scene import SceneSet
 from ae_env.scenes.scene import Split as Split
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
 from simulator.camera import CameraProfile, get_camera
-from simulator.capture.decision import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
-from simulator.capture.decision import MAX_DISC_PX, check_tolerance
+from simulator.capture.limits import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
+from simulator.capture.limits import MAX_DISC_PX, check_tolerance
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED
 from simulator.optics.vignetting import Vignetting, get_lens
 from simulator.utils.checks import (

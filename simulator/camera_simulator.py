@@ -5,7 +5,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self, TypedDict, TypeVar, Unpack, cast, get_args
+from typing import (
+    Any,
+    Literal,
+    Protocol,
+    Self,
+    TypeAlias,
+    TypedDict,
+    TypeVar,
+    Unpack,
+    cast,
+    get_args,
+)
 
 import torch
 from torch import nn
@@ -16,9 +27,10 @@ from simulator.capture.blurred_light import (
     MapApertureBlur,
     NetworkApertureBlur,
 )
+from simulator.capture.limits import RATIO_LIMIT
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, exposed_light, record, sweep_keys
+from simulator.capture.sensor import sweep_keys
 from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
@@ -38,7 +50,7 @@ from simulator.optics.discs import DISC_REACH
 from simulator.optics.vignetting import Vignetting, get_lens
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
-from simulator.settings import CameraSettings
+from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.checks import check_word
 from simulator.utils.compute import check_bfloat16, check_device
 from simulator.utils.tiles import in_tiles, varying
@@ -57,7 +69,7 @@ class HasPrepared(Protocol):
 
 
 #: Sources of a simulation.
-Source = RawImage | PreparedScene | HasPrepared
+Source: TypeAlias = RawImage | PreparedScene | HasPrepared
 #: Reach of the family's networks around a pixel [pixel], a multiple of 8; tiles overlap by it.
 _NOISE_HALO, _MAP_HALO = 80, 56
 #: What bfloat16 changes of the family's results.
@@ -469,17 +481,16 @@ class CameraSimulator:
         """
         noise, aperture = _required("noise", self.noise), _required("aperture", self.aperture)
         check_word("depth", depth, get_args(Depth))
-        keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
+        sweep_keys(seed, [settings])  # a bad seed raises before any work
         prepared = self._seen(source, image_speed, defocus, lens)
         # A prepared scene may be corrected already; a scene is no recording of this body.
         module = self.exposure if isinstance(source, RawImage) else ExposureModule().to(self.device)
-        # What networks found out about the scene is not used.
-        bare = replace(prepared, denoised_lights=(), aperture_blur=None, tolerance=0.0)
-        exposure = bare.exposure(settings)
-        exposed = module(prepared.light[None], exposure.ratio)
+        own = exposure_ratio(prepared.reference, settings)
+        ratio = min(prepared.gain * own, RATIO_LIMIT)
+        exposed = module(prepared.light[None], ratio)
         if not noise.commutes:
             exposed = exposed.clamp(0.0, 1.0)
-        nlf = prepared.nlf.exposed(float(module.w) * exposure.ratio)
+        nlf = prepared.nlf.exposed(float(module.w) * ratio)
         shot, read = (torch.tensor([v]).to(exposed) for v in (nlf.shot, nlf.read))
         with self._autocast(self.precision):
             denoised = opened = noise(exposed, shot, read)
@@ -490,11 +501,19 @@ class CameraSimulator:
                     for s in (prepared.reference, settings)
                 )
                 opened = aperture(denoised, deviation, *f_numbers)
-        at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
-        lights = BlurredLight(opened[0], at_target.source, None)
-        light = exposed_light(lights.blurred(at_target), at_target)
-        capture = torch.empty_like(light)[None]
-        record(Transitions.of([light], [at_target]), prepared.camera, keys=keys, signals=capture)
+        # What follows has the pattern of the source's sensor already, if that is in its light.
+        prnu = prepared.camera.prnu if prepared.nlf.is_zero else 0.0
+        seen = replace(
+            prepared,
+            light=opened[0],
+            camera=replace(prepared.camera, prnu=prnu),
+            nlf=NoiseLevelFunction.zero(),
+            gain=1.0 / own,  # it is exposed already
+            denoised_lights=(),  # what networks found out about the scene is not used
+            aperture_blur=None,
+            tolerance=0.0,
+        )
+        light, capture = seen.expected(settings), seen.expose([settings], seed=seed)
         return Stages(exposed[0], denoised[0], opened[0], light, capture[0])
 
     def simulate(

@@ -17,8 +17,8 @@ import torch
 from ae_env.scenes.ladder import Ladder
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
-from simulator.capture.columns import plan_sweep
-from simulator.capture.decision import MAX_DISC_PX
+from simulator.capture.columns import plan_captures
+from simulator.capture.limits import MAX_DISC_PX
 from simulator.capture.prepared_scene import MAX_IMAGE_SPEED, PreparedScene
 from simulator.capture.sensor import Transitions
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -253,8 +253,9 @@ def source_noises(
     if prepared.nlf.is_zero:
         return None
     gains = np.broadcast_to(gain, len(states))
-    _, _, table, left = plan_sweep(prepared, states, gains, noise=True)
-    averaged = Transitions([prepared.light] * len(states), table, left).averaged_table()
+    planned = plan_captures(prepared, states, gains, noise=True)
+    lights = [prepared.light] * len(states)
+    averaged = Transitions(lights, planned.table, planned.shares).averaged_table()
     noises = averaged[:, 3:].astype(float) * prepared.box_factor**2
     return [NoiseLevelFunction(shot, read) for shot, read in noises.tolist()]
 

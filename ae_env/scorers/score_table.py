@@ -20,7 +20,7 @@ from ae_env.scorers.registry import scorer_fingerprint
 from ae_env.scorers.term_scores import CHUNK, TermScores, slices
 from ae_env.scorers.terms import CompositeScorer
 from simulator.camera import CameraProfile
-from simulator.capture.decision import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.limits import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.utils.cache import cache_key, content_digest, disk_cache

@@ -76,7 +76,7 @@ Noise = Annotated[
         "the row noise and the tails of a calibrated camera's read noise."
     ),
 ]
-#: `simulator.capture.decision.DEFAULT_TOLERANCE`, which a test compares: help imports no torch.
+#: `simulator.capture.limits.DEFAULT_TOLERANCE`, which a test compares: help imports no torch.
 TOLERANCE = 0.1
 
 

@@ -51,7 +51,7 @@ def view(
     from agents.viewer.page import Options, show_page
     from agents.viewer.server import free_port, serve
     from agents.viewer.viewed_scene import find_scenes
-    from simulator.capture.decision import check_tolerance
+    from simulator.capture.limits import check_tolerance
 
     check_tolerance(tolerance)
     make_scorer(scorer)

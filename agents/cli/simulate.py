@@ -57,7 +57,7 @@ def simulate(
     Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
     """
     from simulator import read_raw
-    from simulator.capture.decision import check_tolerance
+    from simulator.capture.limits import check_tolerance
     from simulator.noise.generator import Noise
     from simulator.optics.vignetting import get_lens
 
@@ -134,7 +134,7 @@ def sweep(
     from ae_env.scenes import Scene
     from ae_env.scenes.load import SceneNetworks
     from simulator import read_raw, write_dng
-    from simulator.capture.decision import check_tolerance
+    from simulator.capture.limits import check_tolerance
 
     check_tolerance(tolerance)
     simulator = make_simulator(weights, device, cache, depth)

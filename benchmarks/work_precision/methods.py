@@ -15,7 +15,7 @@ from torch import Tensor
 from benchmarks.denoising import Denoiser, classical
 from benchmarks.fidelity.models import weights
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio
-from simulator.capture.decision import DEFAULT_TOLERANCE
+from simulator.capture.limits import DEFAULT_TOLERANCE
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction

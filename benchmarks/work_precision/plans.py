@@ -32,7 +32,7 @@ from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, incident_ev100
 from simulator.camera_simulator import Depth
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import exposed_light, exposure_table, missing_variance
+from simulator.capture.sensor import missing_variance
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import (
@@ -233,11 +233,11 @@ def _prepared(
 
 def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Tensor, Tensor]:
     """Light (4, H, W) of a planned capture, and the variance that is added to it."""
-    exposure = prepared.exposure(settings)
+    ((_, found),) = prepared.transitions([settings])
+    ratio, table, (share,) = found.table[0, 0, 0].item(), found.table[0, 1:], found.shares()
     # What is white is white, however bright: its neighbours' noise is pooled with it.
-    light = exposed_light(prepared.blurred_light.blurred(exposure), exposure).clamp_(max=1.0)
-    table = exposure_table([exposure])[0, 1:]
-    return light, missing_variance(light, table, exposure.remaining_variance).clamp(min=0.0)
+    light = (found.light[0] * ratio).clamp_(max=1.0)
+    return light, missing_variance(light, table, share).clamp(min=0.0)
 
 
 def distance(light: Tensor, added: Tensor, truth: Tensor, wanted: Tensor, shows: Tensor) -> float:

@@ -18,7 +18,7 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.capture import blurred_frames, columns
 from simulator.capture.blurred_light import new_frames
-from simulator.capture.decision import disc_px
+from simulator.capture.limits import MAX_DISC_PX
 from simulator.capture.plan import noise_balances, opening_errors
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import CodeMeans, Transitions, record, record_units
@@ -38,6 +38,8 @@ _STEPS = (
     *("vignetting", "pixel_response", "noise"),
 )
 _BIT = {name: 1 << bit for bit, name in enumerate(_STEPS)}
+#: Plans of batches keep no more than the sum of the errors.
+_NO_DETAILS = np.empty((0, len(columns.ERRORS) + 3))
 _BLURRING = sum(_BIT[name] for name in _STEPS[1:5])  # those that change the light
 _DENOISING, _OPENING = _BIT["noise_reduction"], _BIT["aperture"]
 #: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
@@ -163,7 +165,7 @@ class CaptureBatch:
         # its noise. Memory of a row is taken when it is used.
         count = num_scenes * len(states)
         self._gain = np.full(count, np.nan)  # light that it was planned for; NaN where it was not
-        self._table = np.zeros((count, 5, 4), np.float32)  # of `exposure_table`
+        self._table = np.zeros((count, 5, 4), np.float32)  # of `Transitions.table`
         self._blur = np.zeros(count, blurred_frames.BLUR)
         # As in `FrameStatistics`; NaN where it depends on light that is not made yet.
         self._excess_variance, self._predicted_error = np.zeros((2, count))
@@ -173,7 +175,7 @@ class CaptureBatch:
         more = np.array([always + response, always]) * (noise is not None)
         self._bits = np.array([*(_BIT[name] for name in columns.STEPS), *more])
         self._blurred = np.zeros(count, np.uintp)  # place of the light, blurred where it must be
-        # Addresses of `Exposure.remaining_variance`, and by row the maps that are not the lens's.
+        # Addresses of `Transitions.remaining_variance`; the maps that are not the lens's, by row.
         self._share, self._maps = np.zeros(count, np.uintp), np.empty(count, object)
         # By scene the light (4, H, W) behind an open aperture, by its number and whether it is the
         # denoised light.
@@ -337,7 +339,7 @@ class CaptureBatch:
         scene = self.prepared_scene(index)
         light, self._size = scene.light.contiguous(), tuple(scene.light.shape[-2:])
         self._light[index] = light, light
-        self._widest = columns.widest_defocus(scene, self._columns)
+        self._widest = max(*self._size, MAX_DISC_PX) * self._apertures.min().item() / 4.0
         box = scene.box_factor
         if box not in self._boxes:
             self._boxes.append(box)
@@ -355,14 +357,16 @@ class CaptureBatch:
         self._scene_columns[index] = columns.scene_column(scene, number, index)
         self._statistics[index] = found = columns.statistics_column(scene)
         self._counted[index] = found.any()
-        if self._noises is None and not scene.nlf.is_zero:
-            self._noises = np.zeros(self.num_scenes, columns.NOISE)
-        if self._noises is not None:
-            self._noises[index] = columns.noise_column(scene, errors=True)
+        if not scene.nlf.is_zero:
+            if self._noises is None:
+                self._noises = np.zeros(self.num_scenes, columns.NOISE)
+            self._noises[index] = columns.noise_column(scene, self._columns, errors=True)
             for network in scene.denoised_lights:
                 self._light[index] = light, network.light.contiguous()
                 lacking = columns.LACKING, columns.LACKING - 1
                 columns.add_networks(self._noises[index], scene, lacking)
+        elif self._noises is not None:
+            self._noises[index] = np.zeros((), columns.NOISE)
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
@@ -374,7 +378,7 @@ class CaptureBatch:
             defocus, numbers = self._scene_columns["defocus"][indices], self._columns["f_number"]
             for i in np.flatnonzero(defocus > self._widest).tolist():  # where it is an error
                 f_number = numbers.item(rows[i] % len(self.states))
-                disc_px(self.prepared_scene(int(indices[i])), f_number)
+                columns.check_disc(defocus.item(i), f_number, self._size)
         self._gain[rows] = np.nan  # what is interrupted stays unknown
         captures = self.noise is not None
         self._plan_rows(indices, rows, gains, captures)
@@ -388,7 +392,8 @@ class CaptureBatch:
         known = self._scene_columns, self._statistics, self._vignetting, self._opening
         camera = self._columns, self._targets, self._size, self._bits, columns.blur_tables()
         made = self._blur, self._table, self._predicted_error, self._excess_variance
-        fixed = known, self._noises, camera, given, (*made, self._share, self._modules)
+        more = self._share, self._modules, _NO_DETAILS
+        fixed = known, self._noises, camera, given, (*made, *more)
         parallel_ranges(
             lambda first, last: columns.plan_frames(first, last, *fixed),
             len(given[0]),

@@ -13,15 +13,13 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from simulator.capture.blurred_frames import BLUR, BlurredFrames, Layout
-from simulator.capture.columns import blur_column, blur_tables, remaining_energy
-from simulator.capture.decision import Exposure, Origin
+from simulator.capture.columns import Origin, blur_tables, remaining_energy
 from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics import discs
@@ -207,11 +205,6 @@ class BlurredLight:
             return self.aperture_blur.opened(opened_to, denoised)
         return self.light if denoised is None else denoised.light
 
-    def blurred(self, exposure: Exposure) -> Tensor:
-        """The light (4, H, W) with every blur of `exposure`; see `lights`."""
-        blurs = np.array([blur_column(exposure)], BLUR)
-        return self.lights([exposure.origin], blurs, (exposure.layout, exposure.lens))[0]
-
     def lights(
         self,
         origins: Sequence[Origin],
@@ -265,19 +258,8 @@ class BlurredLight:
             result[i] = light
         return result
 
-    def with_remaining_noise(self, exposure: Exposure) -> Exposure:
-        """`exposure` with the shares of the source's noise variance that its blurs leave."""
-        blur = np.array([blur_column(exposure)], BLUR)[0]
-        blurred = blur["motion_px"] or blur["defocus_px"] or exposure.opened_to is not None
-        if not blurred and exposure.vignetting is None:
-            return exposure  # nothing averages it
-        fixed = exposure.layout, exposure.opened_to, exposure.vignetting
-        energy = self.remaining_energy(blur, exposure.layout)
-        left = self.remaining_variance(blur, *fixed, energy)
-        return replace(exposure, energy=energy, remaining_variance=left)
-
     def remaining_energy(self, blur: np.void, layout: Layout | None) -> float:
-        """`Exposure.energy` behind a `BLUR`, and the `layout` that it makes differ, if any."""
+        """Share of the source's noise variance that a `BLUR` leaves; 1 where a `layout` differs."""
         if layout is not None:
             return 1.0
         return float(remaining_energy(blur, tuple(self.light.shape[-2:]), blur_tables()))
@@ -290,7 +272,7 @@ class BlurredLight:
         vignetting: np.ndarray | None,
         energy: float,
     ) -> Tensor | None:
-        """`Exposure.remaining_variance` behind a `BLUR`; the others are of the exposure."""
+        """`Transitions.remaining_variance` behind a `BLUR`, beyond its `energy`."""
         left, device = None, self.light.device
         if layout is not None:
             moves, numbers = blur["motion_px"] > 0.0, blur[_PATH].item()

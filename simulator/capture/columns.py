@@ -1,27 +1,26 @@
 """Captures in columns: how each is exposed, in a batch of scenes or in a sweep of one.
 
-`plan_frames` is `simulator.capture.decision.decide` for many scenes, with the errors and the excess
-of noise of `simulator.capture.plan`.
+`plan_frames` decides which steps each takes from the light of its scene to the sensor, and predicts
+its errors; `simulator.capture.plan.SimulationPlan` shows why.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture import decision
 from simulator.capture.blurred_frames import BLUR, LAYOUT, Layout
-from simulator.capture.plan import map_error
-from simulator.capture.sensor import exposure_table
+from simulator.capture.limits import EXTRAPOLATION_ERROR, MAX_DISC_PX, RATIO_LIMIT
 from simulator.capture.statistics import (
     BINS,
     LEVELS,
     ROUNDING,
+    DenoisedLight,
     blur_change,
     curvature,
     excess_error,
@@ -32,7 +31,7 @@ from simulator.capture.statistics import (
 )
 from simulator.noise.noise_level_function import VARIANCE_LIMIT
 from simulator.optics import discs
-from simulator.optics.motion import Path, path_length, taps_of
+from simulator.optics.motion import path_length, taps_of
 from simulator.settings import CameraSettings
 from simulator.utils.compute import kernel
 
@@ -65,13 +64,23 @@ NOISE = np.dtype(
         *((n, "f8") for n in ("f_number", "mean_square")),
         # How many networks there are, whether the aperture blur needs one, whether there is any
         # noise, and which of the above is known; no bools: every element is aligned.
-        *((n, "i8") for n in ("networks", "needs_network", "noisy", "knows_residuals")),
+        *((n, "i8") for n in ("networks", "needs_network", "noisy", "known", "knows_residuals")),
         ("knows_denoised", "i8", NETWORKS),
     ]
 )
 #: The steps that `plan_frames` decides on, in the order of their bits.
 STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "vignetting")
-#: In place of an address of `Exposure.remaining_variance`: that of `remaining_map`.
+#: The errors of a capture, in units of the target's noise: of leaving out each of the first four
+#: steps, and, of what runs and of what is not known, those that `SimulationPlan.errors` names.
+ERRORS = (*STEPS[:4], "network", "clipped highlights", "unknown depth", "ISO", "rounding")
+_NETWORK, _CLIPPED, _DEPTH, _ISO, _ROUNDING = range(4, 9)
+#: Errors of the estimated map of defocus: the blur that it cannot see [pixel of diameter], and the
+#: factor by which what a blurred picture changes when it is blurred again understates what it would
+#: change if it were sharpened.
+MISSED_BLUR, KEPT_BLUR_ERROR = 0.7, 3.0
+#: Second moment of a streak over that of a disc of the same extent, per axis: (1/12) / (1/16).
+STREAK_TO_DISC = 4.0 / 3.0
+#: In place of an address of `Transitions.remaining_variance`: that of `remaining_map`.
 TO_BE_MADE = 1
 #: In place of modules: what `add_networks` has to add before a capture can be planned, the
 #: residuals, or from the next lower number on what each of the networks has denoised.
@@ -84,7 +93,7 @@ STATE = np.dtype([(n, "f8") for n in ("log2_exposure", "time", "f_number", "extr
 
 def state_columns(camera: CameraProfile, states: Sequence[CameraSettings]) -> np.ndarray:
     """(S,) `STATE`."""
-    errors = [decision.EXTRAPOLATION_ERROR * abs(n.extrapolation) for n in camera.nlfs(states)]
+    errors = [EXTRAPOLATION_ERROR * abs(n.extrapolation) for n in camera.nlfs(states)]
     numbers = [(s.log2_exposure, s.exposure_time, s.effective_f_number) for s in states]
     return np.array([(*own, e) for own, e in zip(numbers, errors, strict=True)], STATE)
 
@@ -94,10 +103,15 @@ def noise_columns(camera: CameraProfile, states: Sequence[CameraSettings], box: 
     return np.array([(nlf.shot, nlf.read) for nlf in camera.nlfs(states)]) * (1.0 / box**2)
 
 
-def widest_defocus(scene: PreparedScene, states: np.ndarray) -> float:
-    """The largest `PreparedScene.defocus` whose disc is not too wide at `STATE` (S,)."""
-    most = max(*scene.light.shape[-2:], decision.MAX_DISC_PX)
-    return float(most * states["f_number"].min() / 4.0)
+def check_disc(defocus: float, f_number: float, shape: tuple[int, ...]) -> None:
+    """A `ValueError` unless frames (..., H, W) may have the disc of a `defocus` at `f_number`."""
+    diameter, most = defocus * 4.0 / f_number, max(*shape[-2:], MAX_DISC_PX)
+    if diameter > most:
+        raise ValueError(
+            f"`defocus` (={defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel at "
+            f"f/{f_number:.3g}: it must be at most {most:g} pixel, as wide as the frame "
+            f"({MAX_DISC_PX:g} on smaller ones)"
+        )
 
 
 def statistics_column(scene: PreparedScene) -> np.ndarray:
@@ -117,24 +131,23 @@ def opening_column(scene: PreparedScene, states: np.ndarray) -> np.ndarray:
     return np.array([blur.extent(f_number) for f_number in numbers.tolist()])[which]
 
 
-def noise_column(scene: PreparedScene, *, errors: bool) -> np.ndarray:
-    """The `NOISE` of a scene, which takes a pass over its pixels; `add_networks` adds to it.
+def noise_column(scene: PreparedScene, states: np.ndarray, *, errors: bool) -> np.ndarray:
+    """The `NOISE` of a scene for `STATE` (S,), which takes a pass over its pixels.
 
-    Without `errors`, what does not decide on steps is left out.
+    `add_networks` adds to it. Without `errors`, what does not decide on steps is left out.
     """
-    found = np.zeros((), NOISE)
-    if scene.nlf.is_zero:
-        return found
-    found["source"] = scene.nlf.shot, scene.nlf.read
+    found, blur = np.zeros((), NOISE), scene.aperture_blur
+    found["source"], found["known"] = (scene.nlf.shot, scene.nlf.read), True
     found["bins"] = scene.statistics.noise_columns
-    found["noisy"], found["networks"] = True, len(scene.denoised_lights)
-    blur = scene.aperture_blur
-    if blur is not None:
-        found["needs_network"] = blur.needs_denoised
+    if not scene.nlf.is_zero:
+        found["noisy"], found["networks"] = True, len(scene.denoised_lights)
+        found["needs_network"] = blur is not None and blur.needs_denoised
     if errors:
         found["clipped"] = scene.clipped_light
     if errors and blur is not None:
-        found["f_number"], found["mean_square"] = blur.f_number, blur.mean_square_diameter
+        found["f_number"] = blur.f_number
+        if states["f_number"].max() > blur.f_number:  # else no map need be estimated for it
+            found["mean_square"] = blur.mean_square_diameter
     return found
 
 
@@ -175,15 +188,6 @@ def _address(array: np.ndarray | None) -> int:
     return 0 if array is None else array.ctypes.data
 
 
-def blur_column(exposure: decision.Exposure) -> tuple[Any, ...]:
-    """The `BLUR` of an exposure."""
-    path, own = exposure.path or Path(exposure.motion_px), exposure.subject_path
-    drift = (0.0, 0.0) if own is None else own[3:]
-    numbers = exposure.defocus_px, exposure.motion_px, exposure.path is None
-    layout = layout_column(exposure.layout, own is not None)
-    return (*numbers, *path[:3], *drift, *layout, _address(exposure.vignetting))
-
-
 def layout_column(layout: Layout | None, subject: bool) -> tuple[int, ...]:
     """The `LAYOUT` of a layout, 0 where there is none, or none of its `subject`."""
     arrays = () if layout is None else layout.arrays[: 4 if subject else 2]
@@ -205,64 +209,62 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
             always added for clean and for noisy light, and the tables of `remaining_energy`.
         given: (K,) scenes, rows of the columns, and light relative to the scene's own; and whether
             captures are wanted, or light without noise.
-        made: The columns: (N,) `BLUR`, (N, 5, 4) of `exposure_table`, (N,) error of all that is
+        made: The columns: (N,) `BLUR`, (N, 5, 4) of `Transitions.table`, (N,) error of all that is
             left out or not known, but for `opening_errors`, (N,) excess variance, NaN where it
-            differs between pixels, (N,) addresses of `Exposure.remaining_variance`, 0 for none, and
-            (N,) modules, as sums, or what is `LACKING`.
+            differs between pixels, (N,) addresses of `Transitions.remaining_variance`, 0 for none,
+            (N,) modules, as sums, or what is `LACKING`, and (N, 12) or none at all, each of
+            `ERRORS`, and the extents of aperture, defocus and motion blur [pixel].
     """
     (scenes, statistics, vignetting, openings), states = known, camera[0]
     targets, size, bits, tables = camera[1:]
-    (indices, rows, gains, wanted), (blurs, table, error, excess, shares, modules) = given, made
-    extents, errors, runs = np.zeros(3), np.empty(3), np.empty(3, np.bool_)
+    (indices, rows, gains, wanted), (blurs, table, error, excess, shares, modules) = given, made[:6]
+    extents, errors, runs = np.zeros(3), np.empty(len(ERRORS)), np.empty(3, np.bool_)
     for k in range(first, last):
         row, at = rows[k], rows[k] % len(states)
         scene, state, blur = scenes[indices[k]], states[at], blurs[row]
         target = targets[scene.targets, at]
         ratio = 2.0 ** (state.log2_exposure - scene.log2_reference)
-        ratio = min(scene.gain * gains[k] * ratio, decision.RATIO_LIMIT)
+        ratio = min(scene.gain * gains[k] * ratio, RATIO_LIMIT)
         _set_motion(scene, state.time, size[0], blur)
         extents[0] = openings[scene.rest, at]
         extents[1], extents[2] = scene.defocus * 4.0 / state.f_number, blur.motion_px
-        missing, square, network = 0.0, 0.0, 0
-        if noises is not None and noises[scene.rest].noisy:
-            own = noises[scene.rest]
-            must = own.needs_network and extents[0] > 0.0
-            noise = own, ratio, target, scene.tolerance
-            network, missing, square = _weigh_noise(noise, wanted, must)
-            square += wanted * state.extrapolation_error**2
-            if own.f_number != 0.0 and own.f_number != state.f_number:
-                light = own.bins[0], own.bins[3], statistics[scene.rest, 2]
-                change = blur_change(*light, ratio, own.source, target, wanted)
-                square += map_error(change, own.f_number / state.f_number, own.mean_square) ** 2
+        missing, network = 0.0, 0
+        errors[:] = 0.0
+        if noises is not None and noises[scene.rest].known:
+            noise = noises[scene.rest], ratio, target, scene.tolerance, statistics[scene.rest, 2]
+            network, missing = _weigh_noise(noise, state, wanted, extents[0] > 0.0, errors)
         disc = line = math.inf
-        if scene.tolerance > 0.0 and extents.sum() > 0.0:
+        shows = extents[1] + extents[2] > 0.0 or 0.0 < extents[0] < math.inf
+        if scene.tolerance > 0.0 and shows:  # else no network runs for it
             starts = noises, network, scene.rest, statistics
             disc, line, network = _bound_blurs(*starts, ratio, target)
-            line = line if blur.streaks else decision.STREAK_TO_DISC * disc
-        decision.weigh_blurs(extents, disc, line, missing, scene.tolerance, errors, runs)
+            line = line if blur.streaks else STREAK_TO_DISC * disc
+        _weigh_blurs(extents, disc, line, missing, scene.tolerance, errors[1:4], runs)
         blur.defocus_px = extents[1] if runs[1] else 0.0
         blur.motion_px = extents[2] if runs[2] else 0.0
         blur.diameter, blur.sorts = scene.diameter, scene.sorts
         blur.num_sorts, blur.behind = scene.num_sorts, scene.behind
         blur.vignetting = vignetting[scene.rest, at]
         modules[row] = bits[5] + (blur.vignetting > 0) * bits[4]
-        for i in range(3):
-            modules[row] += runs[i] * bits[1 + i]
-            if not runs[i]:
+        square = 0.0 if network else errors[0] * errors[0]
+        for i in range(1, len(errors)):
+            if i < _NETWORK:
+                modules[row] += runs[i - 1] * bits[i]
+            if i >= _NETWORK or not runs[i - 1]:
                 square += errors[i] * errors[i]
-        error[row], excess[row], shares[row] = math.sqrt(square), 0.0, 0
-        for plane in range(4):
-            table[row, 0, plane] = ratio
-            table[row, 1, plane], table[row, 2, plane] = target[0, plane], target[1, plane]
-            table[row, 3, plane] = table[row, 4, plane] = 0.0
+        error[row] = math.sqrt(square)
+        if len(made[6]):
+            made[6][row, : len(ERRORS)], made[6][row, len(ERRORS) :] = errors, extents
+        _fill_table(ratio, target, table[row])
+        excess[row], shares[row] = 0.0, 0
         if noises is not None and noises[scene.rest].noisy:
             modules[row] += bits[6] - bits[5] + network * bits[0]
             if network == 0:
                 apart = blur.diameter > 0 and (runs[1] or (runs[2] and blur.mask > 0))
                 shares[row] = np.uintp(TO_BE_MADE) if apart or runs[0] else blur.vignetting
                 energy = 1.0 if apart else remaining_energy(blur, size, tables)
-                noise = noises[scene.rest], ratio, target, energy
-                excess[row] = _add_source(noise, shares[row] > 0, table[row])
+                source = noises[scene.rest], ratio, target, energy
+                excess[row] = _add_source(source, shares[row] > 0, table[row])
         if network < 0:
             modules[row] = network
 
@@ -295,14 +297,15 @@ def _set_motion(scene, time, height, blur):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _weigh_noise(noise, wanted, must):  # type: ignore[no-untyped-def]
+def _weigh_noise(noise, state, wanted, opens, errors):  # type: ignore[no-untyped-def]
     """The network, from 1 on, whose light a capture starts from, 0 for none, or `LACKING`.
 
-    There `must` be one where the aperture blur works on no other light. Also the error that counts
-    where blurs are weighed, and the square of all errors that noise and clipped highlights make.
-    See `decision` and `plan.predict_errors`.
+    It is the cheapest within the tolerance, or else the one with the least error; where the
+    aperture `opens` and its blur works on no other light, always the last. Also the error that
+    counts where blurs are weighed. Fills in the `errors` that noise makes, and those of what is not
+    known.
     """
-    own, ratio, target, tolerance = noise
+    own, ratio, target, tolerance, disc = noise
     bins, network, error = own.bins, 0, math.inf
     if wanted:
         left = excess_error(bins[0], bins[1:3], ratio, own.source, target)
@@ -310,9 +313,10 @@ def _weigh_noise(noise, wanted, must):  # type: ignore[no-untyped-def]
         exposed = np.empty((2, 4))
         _expose(own.source, ratio, 1.0, exposed)
         left = math.sqrt(variance_beyond(bins[0], bins[3], ratio, exposed, target, 0.0))
-    weighs = own.networks > 0 and (must or left > tolerance)
+    must = own.networks > 0 and own.needs_network > 0 and opens
+    weighs = must or (own.networks > 0 and left > tolerance)
     if weighs and not own.knows_residuals:
-        return LACKING, 0.0, 0.0
+        return LACKING, 0.0
     for number in range(own.networks if weighs else 0):
         found = own.residuals[number]
         light = found[2], found[3], ratio, own.source, target
@@ -323,10 +327,54 @@ def _weigh_noise(noise, wanted, must):  # type: ignore[no-untyped-def]
             break
     if network == 0 or (left <= error and not must):
         network, error = 0, left
-    hidden = hidden_highlights(ratio, target, own.clipped[0], own.clipped[1])
-    rounding = ROUNDING * relative_level(bins[0], bins[3], ratio, target)
-    missing = error if own.networks > 0 and error <= tolerance else 0.0
-    return network, missing, error * error + hidden * hidden + rounding * rounding
+    errors[0], errors[_NETWORK] = left, error if network else 0.0
+    errors[_CLIPPED] = hidden_highlights(ratio, target, own.clipped[0], own.clipped[1])
+    errors[_ISO] = wanted * state.extrapolation_error
+    errors[_ROUNDING] = ROUNDING * relative_level(bins[0], bins[3], ratio, target)
+    if own.f_number != 0.0 and own.f_number != state.f_number:
+        change = blur_change(bins[0], bins[3], disc, ratio, own.source, target, wanted)
+        errors[_DEPTH] = _map_error(change, own.f_number / state.f_number, own.mean_square)
+    return network, error if own.networks > 0 and error <= tolerance else 0.0
+
+
+@kernel()
+def _map_error(disc, wide, mean_square):  # type: ignore[no-untyped-def]
+    """Error of a map of defocus where the aperture is so many times as `wide` as the source's.
+
+    `disc` is the `blur_change`; the `mean_square` of the map's diameters counts at smaller
+    apertures only: what they would sharpen stays blurred.
+    """
+    if wide <= 1.0:
+        return KEPT_BLUR_ERROR * disc * mean_square * (1.0 - wide * wide)
+    return disc * MISSED_BLUR**2 * (wide * wide - 1.0)
+
+
+@kernel()
+def _weigh_blurs(  # type: ignore[no-untyped-def]
+    extents, disc, row, missing_noise, tolerance, errors, runs
+):
+    """Which of aperture, defocus and motion blur run, and the error of leaving each out, (3,) each.
+
+    `extents` (3,) are in pixels, inf where it is not known; `disc` and `row` are the `curvature` of
+    the light. Noise that stays, `missing_noise`, widens a pixel's distribution, blur that is
+    missing shifts it: squares add. Several missing blurs shift it the same way and add up; the
+    error of each is what it adds to the square, so that the root of the sum of squares of all
+    errors is right for any set of steps.
+    """
+    missing_blur = 0.0
+    for i in range(3):
+        errors[i], runs[i], extent = 0.0, False, extents[i]
+        if extent == 0.0:
+            continue
+        error = math.inf
+        if extent < math.inf:
+            error = (row if i == 2 else disc) * extent * extent
+        together = missing_blur + error
+        runs[i] = not math.hypot(missing_noise, together) <= tolerance
+        if error:
+            errors[i] = math.sqrt(error * (together + missing_blur))
+        if not runs[i]:
+            missing_blur = together
 
 
 @kernel()
@@ -341,6 +389,15 @@ def remaining_energy(blur, size, tables):  # type: ignore[no-untyped-def]
         return discs.kernel_energy(blur.motion_px, blur.defocus_px, *tables[1])
     moved = blur.extent, blur.direction, blur.turn, blur.drift_x, blur.drift_y
     return discs.path_energy(taps_of(*moved, *size), blur.defocus_px, tables[0])
+
+
+@kernel()
+def _fill_table(ratio, target, table):  # type: ignore[no-untyped-def]
+    """The `table` (5, 4) of a clean source."""
+    for plane in range(4):
+        table[0, plane] = ratio
+        table[1, plane], table[2, plane] = target[0, plane], target[1, plane]
+        table[3, plane] = table[4, plane] = 0.0
 
 
 @kernel()
@@ -377,56 +434,66 @@ def blur_tables() -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     return discs.disc_correlations(), discs.radius_table()
 
 
-def plan_sweep(
-    scene: PreparedScene, states: Sequence[CameraSettings], gains: np.ndarray, *, noise: bool
-) -> tuple[Sequence[decision.Origin], np.ndarray, np.ndarray, Sequence[torch.Tensor | None] | None]:
-    """Captures of one scene at S states, in light (S,) relative to its own; see `decide`.
+#: The light of a scene that a capture starts from: which network has denoised it, and the
+#: effective f-number that it is opened to; None for neither.
+Origin = tuple[DenoisedLight | None, float | None]
 
-    Returns:
-        The origins of their light, `BLUR` (S,), (S, 5, 4) of `exposure_table`, and the
-        `Exposure.remaining_variance`, None in place of all where the source has no noise.
+
+class Planned(NamedTuple):
+    """How S captures of one scene are made, in columns; see `plan_frames`."""
+
+    origins: list[Origin]
+    blurs: np.ndarray  # (S,) `BLUR`
+    table: np.ndarray  # (S, 5, 4) of `Transitions.table`
+    shares: list[torch.Tensor | None]  # of `Transitions.remaining_variance`
+    details: np.ndarray  # (S, 12) `ERRORS`, and extents of aperture, defocus and motion [pixel]
+
+
+def plan_captures(
+    scene: PreparedScene,
+    states: Sequence[CameraSettings],
+    gains: np.ndarray,
+    *,
+    noise: bool,
+    errors: bool = False,
+) -> Planned:
+    """Captures of a scene at S states, in light (S,) relative to its own, or without `noise`.
+
+    Without `errors`, those of what is not known are 0, and errors of noise where there is none to
+    decide on. A `ValueError` where a disc is too wide.
     """
-    # One state alone is decided on in less time than it takes to call a kernel.
-    inside = len(states) > 1 and scene.defocus <= widest_defocus(
-        scene, columns := state_columns(scene.camera, states)
-    )
-    if not inside or len(scene.denoised_lights) > NETWORKS:
-        pairs = zip(states, gains.tolist(), strict=True)
-        exposures = [decision.decide(scene, state, noise=noise, gain=gain) for state, gain in pairs]
-        blurs = np.array([*map(blur_column, exposures)], BLUR)
-        shares = [exposure.remaining_variance for exposure in exposures]
-        return [e.origin for e in exposures], blurs, exposure_table(exposures), shares
-    count, rows = len(states), np.arange(len(states))
+    columns, count, rows = state_columns(scene.camera, states), len(states), np.arange(len(states))
+    check_disc(scene.defocus, columns["f_number"].min().item(), scene.light.shape)
     blurs, table, modules = np.zeros(count, BLUR), np.empty((count, 5, 4), np.float32), 0 * rows
     made = blurs, table, *np.empty((2, count)), np.zeros(count, np.uintp), modules
+    details = np.zeros((count, len(ERRORS) + 3))
     own = np.array([scene_column(scene, 0, 0)], SCENE), statistics_column(scene)[None]
     known = *own, vignetting_column(scene, states)[None], opening_column(scene, columns)[None]
-    noises = None if scene.nlf.is_zero else noise_column(scene, errors=False)[None]
+    counts = errors or not scene.nlf.is_zero
+    noises = noise_column(scene, columns, errors=errors)[None] if counts else None
     targets = noise_columns(scene.camera, states, scene.box_factor)[None]
     bits = np.array([1, NETWORKS + 1, 0, 0, 0, 0, 0])  # of noise reduction and aperture alone
     camera = columns, targets, tuple(scene.light.shape[-2:]), bits, blur_tables()
     given = 0 * rows, rows, gains.astype(float), noise
-    plan_frames(0, count, known, noises, camera, given, made)
+    plan_frames(0, count, known, noises, camera, given, (*made, details))
     while (modules < 0).any():
         assert noises is not None
         add_networks(noises[0], scene, modules[modules < 0].tolist())
-        plan_frames(0, count, known, noises, camera, given, made)
+        plan_frames(0, count, known, noises, camera, given, (*made, details))
     networks, numbers = (None, *scene.denoised_lights), columns["f_number"].tolist()
     opens, which = (found.tolist() for found in np.divmod(modules, NETWORKS + 1))
     each = zip(which, opens, numbers, strict=True)
     origins = [(networks[network], number if opened else None) for network, opened, number in each]
-    if noises is None:
-        return origins, blurs, table, None
     left: list[torch.Tensor | None] = [None] * count
     for i in np.flatnonzero(made[4]).tolist():
         left[i] = remaining_map(scene, blurs[i], numbers[i], origins[i][1] is not None)
-    return origins, blurs, table, left
+    return Planned(origins, blurs, table, left, details)
 
 
 def remaining_map(
     scene: PreparedScene, blur: np.void, f_number: float, opens: bool
 ) -> torch.Tensor | None:
-    """`Exposure.remaining_variance` at an `f_number` behind a `BLUR`; the aperture may open."""
+    """`Transitions.remaining_variance` at an `f_number` behind a `BLUR`; the aperture may open."""
     light, moves = scene.blurred_light, blur["motion_px"] > 0.0 and blur["mask"]
     layout = scene.layout if blur["defocus_px"] or moves else None
     opened_to, energy = f_number if opens else None, light.remaining_energy(blur, layout)

@@ -5,19 +5,20 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
 
 from simulator.camera import get_camera
-from simulator.capture.decision import EXTRAPOLATION_ERROR, SIGNAL_LIMIT, Exposure, Step
-from simulator.capture.sensor import Transitions, exposure_table, record
-from simulator.capture.statistics import ROUNDING, SUMS, hidden_highlights, noise_numbers
-from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction
+from simulator.capture.columns import ERRORS, STEPS, Planned, noise_columns, plan_captures
+from simulator.capture.limits import SIGNAL_LIMIT
+from simulator.capture.sensor import Transitions, record
+from simulator.capture.statistics import SUMS, DenoisedLight, network_error, noise_numbers
+from simulator.noise.noise_level_function import VARIANCE_LIMIT
 from simulator.settings import CameraSettings
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
@@ -49,13 +50,52 @@ _OPERATIONS = {
     "noise": 14,
     "clip_and_quantise": 6,
 }
-#: Errors of the estimated map of defocus: its relative error of the blur that it adds, the blur
-#: that it cannot see [pixel of diameter], and the factor by which what a blurred picture changes
-#: when it is blurred again understates what it would change if it were sharpened.
-DEPTH_ERROR, MISSED_BLUR, KEPT_BLUR_ERROR = 0.6, 0.7, 3.0
+#: Relative error of an estimated map of defocus in the blur that it adds.
+DEPTH_ERROR = 0.6
 _TINY = torch.finfo(torch.float32).tiny
 #: Samples that are worth a thread where noise is balanced.
 _BALANCED = 2**15
+_NOT_WANTED, _LIGHT_WANTED = "only the light is wanted", "the light is wanted without noise"
+#: Reasons why a blur runs, and why it is left out; filled in when a plan is shown.
+_BLUR_REASONS = {
+    "aperture": (
+        "the aperture opens and adds blur (up to {extent:.2g} pixel)",
+        "the blur that opening adds (up to {extent:.2g} pixel) would hardly show",
+    ),
+    "defocus": (
+        "the defocus disc is {extent:.3g} pixel wide",
+        "the defocus disc is {extent:.2g} pixel wide, which would hardly show",
+    ),
+    "motion_blur": (
+        "the image moves by {extent:.3g} pixel during the exposure",
+        "the image moves by {extent:.2g} pixel during the exposure, which would hardly show",
+    ),
+}
+#: Reasons why there is no blur: where no pixel's defocus was estimated; and where it was, as the
+#: aperture does not open, and as it does.
+_NO_BLUR_REASONS = {
+    "aperture": (
+        "the scene is taken as in focus: `depth` is not 'unknown'",
+        "the aperture does not open; what is blurred in the source stays so",
+        "the picture was found to be in focus throughout",
+    ),
+    "defocus": (
+        "the scene is taken as far or in focus throughout",
+        *["none is given for the whole frame: each pixel's was estimated"] * 2,
+    ),
+    "motion_blur": ("the image does not move",) * 3,
+}
+
+
+class Step(NamedTuple):
+    """A step that a capture may leave out."""
+
+    name: str  # in `SimulationPlan.modules`
+    runs: bool
+    reason: str  # why it runs, or does not
+    #: Error of leaving it out where it does not run, in units of the target's noise.
+    error: float = 0.0
+    operations: int = 0  # arithmetic operations, all pixels together; a network's for all settings
 
 
 @dataclass(frozen=True)
@@ -69,49 +109,30 @@ class SimulationPlan:
     """
 
     settings: CameraSettings  #: to simulate
-    exposure: Exposure  #: the exposure that was decided for them
+    ratio: float  #: of the exposure, from the prepared scene's reference to the capture
+    steps: tuple[Step, ...]  #: all in the order in which they run, with the reason for each
+    denoised: DenoisedLight | None  #: noise-reduced light that it starts from
     #: The parts of the error by what they come from; ``"left out"``, ``"network"``, ``"clipped
     #: highlights"``, ``"unknown depth"``, ``"ISO"``, ``"rounding"``.
     errors: Mapping[str, float]
     #: Variance of the source's noise beyond the target's, relative to the target's: mean over the
     #: pixels. 0 means that the noise is exact.
     excess_noise: float
-    lacks_noise: bool  #: whether any pixel has less noise than the target
     #: Share of the pixels that are saturated in the source: what they would show at a darker
     #: exposure is unknown.
     clipped_source: float
     tolerance: float  #: error that the capture may have
-    samples: int  #: of the raw
-
-    @functools.cached_property
-    def steps(self) -> tuple[Step, ...]:
-        """Every step in order, with the reason why it runs or not."""
-        wanted, lacks = self.exposure.noise, self.lacks_noise
-        unwanted = "" if wanted else "only the light is wanted"
-        enough = "no pixel lacks noise: the source has the target's already, or more"
-        steps = (
-            Step("exposure", True, ""),
-            *self.exposure.steps,
-            Step("noise", wanted and lacks, unwanted or ("" if lacks else enough)),
-            Step("clip_and_quantise", wanted, unwanted),
-        )
-        return tuple(_planned(step, self.samples) for step in steps)
+    extrapolated: float  #: stops by which the ISO is outside the noise calibration of the camera
 
     @property
     def network(self) -> str | None:
         """Name of the noise module that runs; None for none."""
-        denoised = self.exposure.denoised
-        return None if denoised is None else denoised.name
-
-    @property
-    def extrapolated(self) -> float:
-        """Stops by which the target's ISO lies outside the camera's calibration."""
-        return abs(self.exposure.target.extrapolation) if self.exposure.noise else 0.0
+        return None if self.denoised is None else self.denoised.name
 
     @property
     def error_bound(self) -> float:
         """Bound below which the error is in 90 % of all cases, whatever its largest part."""
-        leading, denoised = max(self.errors, key=self.errors.__getitem__), self.exposure.denoised
+        leading, denoised = max(self.errors, key=self.errors.__getitem__), self.denoised
         factor = _BOUND[leading]
         if leading == "network" and denoised is not None and denoised.residual is not None:
             factor *= denoised.residual.spread
@@ -142,8 +163,7 @@ class SimulationPlan:
     def milliseconds(self) -> tuple[float, float]:
         """Estimated time on this machine [ms]: of this capture, and once for all settings."""
         own = sum(s.operations for s in self.steps if s.name != "noise_reduction")
-        denoised = self.exposure.denoised
-        shared = 0.0 if denoised is None else denoised.seconds()
+        shared = 0.0 if self.denoised is None else self.denoised.seconds()
         return 1e3 * own * seconds_per_operation(), 1e3 * shared
 
     def explain(self) -> str:
@@ -160,7 +180,7 @@ class SimulationPlan:
         capture, shared = self.milliseconds
         once = f" and {_short(shared)} ms once for all settings" if shared else ""
         return (
-            f"{self.settings}: {self.exposure.ratio:.4g} x the light; {runs}\n"
+            f"{self.settings}: {self.ratio:.4g} x the light; {runs}\n"
             f"error {_short(self.predicted_error)} of the target's noise, 90 % bound "
             f"{_short(self.error_bound)}{': ' * bool(parts)}{', '.join(parts)} "
             f"(tolerance {self.tolerance:g}: {within})\n"
@@ -206,10 +226,9 @@ def _counted(number: int) -> str:
 @functools.cache
 def seconds_per_operation() -> float:
     """Time of one of the operations that `SimulationPlan` counts, measured on this machine [s]."""
-    light = torch.zeros(4, 128, 128)
-    noises = NoiseLevelFunction.zero(), NoiseLevelFunction((1e-4,) * 4, (1e-7,) * 4)
-    exposure = Exposure(1.0, *noises)
-    transition, camera = Transitions.of([light], [exposure]), get_camera("nikon_z6")
+    light, table = torch.zeros(4, 128, 128), np.zeros((1, 5, 4), np.float32)
+    table[0, :3] = [[1.0], [1e-4], [1e-7]]
+    transition, camera = Transitions([light], table), get_camera("nikon_z6")
     signals, keys, times = torch.empty(1, 4, 128, 128), np.ones(1, np.uint64), []
     for _ in range(5):
         start = time.perf_counter()
@@ -219,62 +238,132 @@ def seconds_per_operation() -> float:
     return min(times) / (each * light.numel())
 
 
-def _planned(step: Step, samples: int) -> Step:
-    """`step` as a plan shows it; what runs leaves no error."""
-    reason = step.reason.format(extent=step.extent, error=step.error)
-    if not step.runs:
-        return step._replace(reason=reason)
-    per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)  # taps of a disc
-    operations = per_sample * samples if step.network is None else step.network.operations
-    return step._replace(reason=reason, estimate=0.0, operations=operations)
+def plan_capture(
+    scene: PreparedScene, settings: CameraSettings, *, noise: bool = True
+) -> SimulationPlan:
+    """The plan of a capture of a scene at `settings`, or of its light without `noise`."""
+    planned = plan_captures(scene, [settings], np.ones(1), noise=noise, errors=True)
+    targets = noise_columns(scene.camera, [settings], scene.box_factor)
+    excess, lacks = 0.0, bool(targets.any())
+    if planned.table[0, 3:].any():  # else the light need not be made to see that
+        lights = [scene.blurred_light.source(planned.origins[0])]
+        balance = noise_balances(lights, planned.shares, planned.table, targets)
+        excess, lacks = balance[0].item(), balance[1].item()
+    denoised, samples = planned.origins[0][0], scene.light.numel()
+    operations = {name: each * samples for name, each in _OPERATIONS.items()}
+    operations["defocus"] = 2 * (1 + int(planned.blurs["defocus_px"].item()) ** 2) * samples
+    operations["noise_reduction"] = 0 if denoised is None else denoised.operations
+    decided = [*_blurs_and_noise(scene, settings.effective_f_number, planned, noise)]
+    decided += _products(scene, settings.effective_f_number, noise)
+    reason = "no pixel lacks noise: the source has the target's already, or more"
+    reasons = ("" if lacks else reason, "") if noise else (_NOT_WANTED, _NOT_WANTED)
+    decided.append(("noise", noise and lacks, reasons[0], 0.0))
+    decided.append(("clip_and_quantise", noise, reasons[1], 0.0))
+    steps = [Step("exposure", True, "", 0.0, operations["exposure"])]
+    for name, runs, reason, error in decided:
+        cost = (0.0, operations[name]) if runs else (error, 0)
+        steps.append(Step(name, runs, reason, *cost))
+    (nlf,) = scene.camera.nlfs([settings])
+    return SimulationPlan(
+        settings=settings,
+        ratio=planned.table[0, 0, 0].item(),
+        steps=tuple(steps),
+        denoised=denoised,
+        errors={"left out": math.hypot(*(step.error for step in steps))}
+        | _predict_errors(scene, planned, targets, noise),
+        excess_noise=excess,
+        clipped_source=scene.saturated_share,
+        tolerance=scene.tolerance,
+        extrapolated=abs(nlf.extrapolation) if noise else 0.0,
+    )
 
 
-def predict_errors(
-    scene: PreparedScene, settings: CameraSettings, exposure: Exposure
+#: A step, whether it runs, why, and the error of leaving it out.
+_Decided = tuple[str, bool, str, float]
+
+
+def _blurs_and_noise(
+    scene: PreparedScene, f_number: float, planned: Planned, noise: bool
+) -> Iterator[_Decided]:
+    """The steps that `plan_frames` decides on."""
+    ((denoised, opened_to),), (blur,), (found,) = planned.origins, planned.blurs, planned.details
+    opens = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0
+    runs = denoised is not None, opened_to is not None, *map(bool, opens)
+    extents, source = found[len(ERRORS) :].tolist(), scene.aperture_blur
+    reasons = [_reason_of_noise(scene, runs[0], found[0], extents[0] > 0.0, noise)]
+    known = 0 if source is None else 1 + (f_number < source.f_number)
+    for name, ran, extent in zip(STEPS[1:], runs[1:], extents, strict=False):
+        if not extent:
+            reasons.append(_NO_BLUR_REASONS[name][known])
+        elif extent == math.inf:  # not known before the network runs
+            reasons.append("the aperture opens and adds blur")
+        else:
+            reasons.append(_BLUR_REASONS[name][not ran].format(extent=extent))
+    for name, ran, reason, error in zip(STEPS, runs, reasons, found.tolist(), strict=False):
+        without = f"; leaving it out would be an error of {error:.2g}"
+        yield name, ran, reason + without * (ran and error < math.inf), error
+
+
+def _reason_of_noise(
+    scene: PreparedScene, runs: bool, error: float, opens: bool, noise: bool
+) -> str:
+    """Why noise reduction runs, or does not; leaving it out makes an `error`."""
+    blur = scene.aperture_blur
+    if scene.nlf.is_zero:
+        return "the source carries no noise"
+    if not scene.denoised_lights:
+        return "the simulator has no noise module"
+    if runs and blur is not None and blur.needs_denoised and opens:
+        return "the aperture module works on the noise-reduced light only"
+    if runs:
+        return "the source is noisier than the target" if noise else _LIGHT_WANTED
+    if error > scene.tolerance:
+        return "no network would make a smaller error than the noise"
+    if not noise:
+        return "the source's noise is small against the target's"
+    if error == 0.0:
+        return "the target is at least as noisy: noise is added up to it"
+    return "the source's noise beyond the target's is within the tolerance"
+
+
+def _products(scene: PreparedScene, f_number: float, noise: bool) -> Iterator[_Decided]:
+    """Vignetting and pixel response, where there are any: too cheap to weigh their errors."""
+    lens, prnu = scene.lens, scene.camera.prnu
+    if lens is not None:
+        reason, runs = "the source was taken through the same aperture", False
+        if scene.vignetting(f_number) is not None:
+            loss, runs = lens.corner_loss(f_number), True
+            reason = f"the lens takes {loss:.2g} EV of the corners' light"
+            if scene.seen_through_lens:
+                source = lens.corner_loss(scene.reference.effective_f_number)
+                reason += f", {source:.2g} in the source"
+        yield "vignetting", runs, reason, 0.0
+    if prnu:
+        reason = f"the gains of photosites differ by {prnu:.2%}"
+        if not noise:
+            reason = _NOT_WANTED
+        elif not scene.nlf.is_zero:
+            reason = "the source has the pattern of its own sensor"
+        yield "pixel_response", noise and scene.nlf.is_zero, reason, 0.0
+
+
+def _predict_errors(
+    scene: PreparedScene, planned: Planned, targets: np.ndarray, noise: bool
 ) -> dict[str, float]:
-    """`SimulationPlan.errors` of the exposure that was decided for `settings`."""
-    ratio, target = exposure.ratio, exposure.target
-    extrapolated = abs(target.extrapolation) if exposure.noise else 0.0
-    rounding = ROUNDING * scene.statistics.relative_level(ratio, target)
-    if exposure.denoised is not None and exposure.denoised.rounding is not None:
-        error_of, bfloat16 = scene.blurred_light.residuals.error, exposure.denoised.rounding
-        rounding = math.hypot(rounding, error_of(bfloat16, ratio, target, noise=exposure.noise))
-    return {
-        "left out": exposure.left_out,
-        "network": exposure.steps[0].residual,
-        "clipped highlights": hidden_highlights(ratio, noise_numbers(target), *scene.clipped_light),
-        "unknown depth": _depth_error(scene, settings, exposure),
-        "ISO": EXTRAPOLATION_ERROR * extrapolated,
-        "rounding": rounding,
-    }
-
-
-def _depth_error(scene: PreparedScene, settings: CameraSettings, exposure: Exposure) -> float:
-    """Error due to a depth that is not known, in units of the target's noise."""
-    blur, noise, ratio = scene.aperture_blur, exposure.noise, exposure.ratio
-    if blur is None or settings.effective_f_number == blur.f_number:  # no map is needed
-        return 0.0
-    disc = scene.statistics.blur_change(ratio, scene.nlf, exposure.target, noise=noise)
-    wide, mean_square = blur.f_number / settings.effective_f_number, blur.mean_square_diameter
-    error = map_error(disc, wide, mean_square)
-    if exposure.opened_to is None:
-        return error
-    light = scene.light if exposure.denoised is None else exposure.denoised.light
-    lights = [light], [scene.blurred_light.source(exposure.origin)]
-    targets = noise_numbers(exposure.target)[None]
-    return math.hypot(error, *opening_errors(*lights, np.array([ratio]), targets, noise))
-
-
-@kernel()
-def map_error(disc, wide, mean_square):  # type: ignore[no-untyped-def]
-    """Error of a map of defocus where the aperture is so many times as `wide` as the source's.
-
-    `disc` is `LightStatistics.blur_change`; the `mean_square` of the map's diameters counts at
-    smaller apertures only: what they would sharpen stays blurred.
-    """
-    if wide <= 1.0:
-        return KEPT_BLUR_ERROR * disc * mean_square * (1.0 - wide * wide)
-    return disc * MISSED_BLUR**2 * (wide * wide - 1.0)
+    """The `SimulationPlan.errors` of what runs, and of what is not known."""
+    errors = dict(zip(ERRORS[4:], planned.details[0, 4:].tolist(), strict=False))
+    (denoised, opened_to), ratios = planned.origins[0], planned.table[:, 0, 0].astype(float)
+    if opened_to is not None:
+        before = scene.light if denoised is None else denoised.light
+        lights = [before], [scene.blurred_light.source(planned.origins[0])]
+        opening = opening_errors(*lights, ratios, targets, noise).item()
+        errors["unknown depth"] = math.hypot(errors["unknown depth"], opening)
+    if denoised is not None and denoised.rounding is not None:
+        columns = scene.blurred_light.residuals.columns(denoised.rounding)
+        noises = noise_numbers(scene.nlf), targets[0]
+        bfloat16 = network_error(*columns, ratios.item(), *noises, noise)
+        errors["rounding"] = math.hypot(errors["rounding"], bfloat16)
+    return errors
 
 
 def opening_errors(
@@ -294,29 +383,16 @@ def opening_errors(
     return DEPTH_ERROR * np.sqrt(squares / lights[0].numel())
 
 
-def noise_balance(light: torch.Tensor, exposure: Exposure) -> tuple[float, bool]:
-    """`SimulationPlan.excess_noise` and `lacks_noise` of `light` (4, H, W) in an `exposure`.
-
-    Neither the ratio of the exposure nor its noise are in `light` yet.
-    """
-    target = exposure.target
-    if exposure.source_noise.is_zero:
-        return 0.0, not target.is_zero
-    shares, table = [exposure.remaining_variance], exposure_table([exposure])
-    excess, lacks = noise_balances([light], shares, table, noise_numbers(target)[None])
-    return excess.item(), lacks.item()
-
-
 def noise_balances(
     lights: Sequence[torch.Tensor],
     shares: Sequence[torch.Tensor | None],
     table: np.ndarray,
     targets: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`noise_balance` (B,) each of lights (4, H, W).
+    """Excess variance (B,) of lights (4, H, W), and whether any pixel lacks noise.
 
-    `shares` are their `Exposure.remaining_variance`, `table` that of the exposures, `targets`
-    (B, 2, 4) shot and read noise.
+    See `SimulationPlan.excess_noise`. `shares` are `Transitions.remaining_variance`, `table` is
+    `Transitions.table`, `targets` (B, 2, 4) are shot and read noise. Lights are not exposed yet.
     """
     excess, lacks = _sums(_balance, lights, shares, table, targets).T
     return np.minimum(excess / lights[0].numel(), VARIANCE_LIMIT), lacks > 0.0

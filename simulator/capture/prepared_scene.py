@@ -14,10 +14,10 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
-from simulator.capture.columns import plan_sweep
-from simulator.capture.decision import DEFAULT_TOLERANCE, Exposure, check_tolerance, decide, disc_px
-from simulator.capture.plan import SimulationPlan, noise_balance, predict_errors
-from simulator.capture.sensor import Transitions, exposed_light, pixel_response, record, sweep_keys
+from simulator.capture.columns import NETWORKS, check_disc, noise_columns, plan_captures
+from simulator.capture.limits import DEFAULT_TOLERANCE, SIGNAL_LIMIT, check_tolerance
+from simulator.capture.plan import SimulationPlan, noise_balances, plan_capture
+from simulator.capture.sensor import Transitions, pixel_response, record, sweep_keys
 from simulator.capture.statistics import DenoisedLight, LightStatistics
 from simulator.noise.generator import Noise
 from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoises
@@ -57,7 +57,7 @@ class PreparedScene:
     defocus: float = 0.0
     gain: float = 1.0  #: light relative to `light`, where it changes over time
     #: `light` with its noise removed by each noise module, the cheapest first, for targets that are
-    #: cleaner than the source; none where there is no module or no noise.
+    #: cleaner than the source; at most 3, none where there is no module or no noise.
     denoised_lights: tuple[DenoisedLight, ...] = ()
     #: Adds the blur of apertures wider than the reference's to a scene whose depth is not known;
     #: None takes it as far.
@@ -87,6 +87,9 @@ class PreparedScene:
             statistics = None if cached is None else cached.statistics
             lights = BlurredLight(self.light, self.nlf, self.aperture_blur, statistics)
             object.__setattr__(self, "blurred_light", lights)
+        if len(self.denoised_lights) > NETWORKS:
+            count = len(self.denoised_lights)
+            raise ValueError(f"`denoised_lights` (length {count}) must be at most {NETWORKS}")
         for denoised in self.denoised_lights:
             check_type("denoised_lights", denoised, DenoisedLight)
             if denoised.shape not in (None, self.light.shape):
@@ -97,7 +100,7 @@ class PreparedScene:
         unit = " frame heights per second"
         check_number("image_speed", self.image_speed, 0.0, MAX_IMAGE_SPEED, more=unit)
         check_number("defocus", self.defocus, 0.0, sys.float_info.max)
-        disc_px(self, 4.0)
+        check_disc(self.defocus, 4.0, self.light.shape)
         check_number("gain", self.gain, 0.0, sys.float_info.max)
         check_type("lens", self.lens, Vignetting, None)
         if self.layout is not None and self.layout.defocus.shape != self.light.shape[-2:]:
@@ -166,50 +169,28 @@ class PreparedScene:
 
     # -- what a change of settings takes ------------------------------------------------------
 
-    def exposure(
-        self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
-    ) -> Exposure:
-        """Exposure of a capture at `settings`, without the steps that `tolerance` leaves out.
-
-        Without `noise`, that of the source cannot count as part of the target's; the light is
-        `gain` times this scene's.
-        """
-        check_type("settings", settings, CameraSettings)
-        return decide(self, settings, noise=noise, gain=gain)
-
     def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
         """Steps, reasons, error and cost of a capture at `settings`, or without `noise`."""
-        exposure = self.exposure(settings, noise=noise)
-        # A clean source lacks all of the noise: its light need not be made to see that.
-        origin = (None, None) if exposure.source.is_zero else exposure.origin
-        light = self.blurred_light.source(origin)
-        excess_noise, lacks_noise = noise_balance(light, exposure)
-        return SimulationPlan(
-            settings=settings,
-            exposure=exposure,
-            errors=predict_errors(self, settings, exposure),
-            excess_noise=excess_noise,
-            lacks_noise=lacks_noise,
-            clipped_source=self.saturated_share,
-            tolerance=self.tolerance,
-            samples=self.light.numel(),
-        )
+        check_type("settings", settings, CameraSettings)
+        return plan_capture(self, settings, noise=noise)
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel at `settings`: the camera's, or the source's where that is more.
 
         Shot and read noise are compared apart: a mixed case is stated too high, not too low.
         """
-        exposure = self.exposure(settings)
-        source = exposure.source_noise.scaled(float(self.box_factor**2))
-        return self.camera.nlf(settings.iso, settings.exposure_time).at_least(source)
+        planned = plan_captures(self, [settings], np.ones(1), noise=True)
+        beyond = np.maximum(-planned.table[0, 1:3].astype(float), 0.0) * self.box_factor**2
+        nlf = self.camera.nlf(settings.iso, settings.exposure_time)
+        shot, read = (np.array([nlf.shot, nlf.read]) + beyond).tolist()
+        return nlf.at_least(NoiseLevelFunction(shot, read))
 
     # -- captures -----------------------------------------------------------------------------
 
     def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
         """Light on the sensor at `settings`, (4, H, W), without noise or clipping, times `gain`."""
-        exposure = self.exposure(settings, noise=False, gain=gain)
-        return exposed_light(self.blurred_light.blurred(exposure), exposure)
+        known = self._transition(settings, noise=False, gain=np.array([gain]))
+        return (known.light[0] * known.table[0, 0, 0].item()).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
     def capture(
         self, settings: CameraSettings, seed: int = 0, *, noise: Noise = "exact"
@@ -229,9 +210,14 @@ class PreparedScene:
         Returns:
             (4, H, W) float32 in [-pedestal, 1], and its excess noise (see `SimulationPlan`).
         """
-        exposure = self.exposure(settings)
+        check_type("settings", settings, CameraSettings)
         (frame,) = self.expose([settings], seed=seed, noise=noise)
-        return frame, noise_balance(self.blurred_light.blurred(exposure), exposure)[0]
+        if self.nlf.is_zero:
+            return frame, 0.0
+        known = self._transition(settings)
+        targets = noise_columns(self.camera, [settings], self.box_factor)
+        excess, _ = noise_balances([known.light[0]], known.shares(), known.table, targets)
+        return frame, excess.item()
 
     def expose(
         self,
@@ -288,23 +274,31 @@ class PreparedScene:
         """All that captures at `states` depend on, except for their noise: parts of them.
 
         States that share their blur follow each other, so that none is computed twice; they are one
-        part where the light of all may be held at once. `noise` and `gain` as of `exposure`.
+        part where the light of all may be held at once. Without `noise`, that of the source cannot
+        count as part of the target's. `gain` is that of `expose`.
         """
+        if not states:
+            return
         gains = np.ones(len(states)) if gain is None else gain
-        origins, blurs, table, remaining = plan_sweep(self, states, gains, noise=noise)
-        extents = blurs["defocus_px"].tolist(), blurs["motion_px"].tolist()
-        kinds, parts = [*zip(origins, *extents, strict=True)], [slice(0, len(states))]
+        planned = plan_captures(self, states, gains, noise=noise)
+        extents = planned.blurs[["defocus_px", "motion_px"]].tolist()
+        kinds, parts = [*zip(planned.origins, extents, strict=True)], [slice(0, len(states))]
         ranks = {kind: rank for rank, kind in enumerate(kinds)}
         if len(ranks) * self.light.nbytes > _TOGETHER_BYTES:
             order = sorted(range(len(kinds)), key=lambda i: ranks[kinds[i]])
             parts = [slice(i, i + 1) for i in order]
         for some in parts:
-            owners = self.layout, self.lens
-            lights = self.blurred_light.lights(origins[some], blurs[some], owners)
-            lights = [light.contiguous() for light in lights]
-            shares = None if remaining is None else remaining[some]
-            found = Transitions(lights, table[some], shares)
+            blurs, owners = (planned.origins[some], planned.blurs[some]), (self.layout, self.lens)
+            lights = [light.contiguous() for light in self.blurred_light.lights(*blurs, owners)]
+            shares = None if self.nlf.is_zero else planned.shares[some]
+            found = Transitions(lights, planned.table[some], shares)
             yield some, found.seen_by([self.response] * len(lights)) if noise else found
+
+    def _transition(self, settings: CameraSettings, **options: Any) -> Transitions:
+        """The one of `transitions` at `settings`."""
+        check_type("settings", settings, CameraSettings)
+        ((_, found),) = self.transitions([settings], **options)
+        return found
 
     def _frames(self, count: int, out: torch.Tensor | None) -> torch.Tensor:
         """Memory for `count` frames, `out` if that fits."""

@@ -36,7 +36,7 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.decision import PEDESTAL, SIGNAL_LIMIT, Exposure
+from simulator.capture.limits import PEDESTAL, SIGNAL_LIMIT
 from simulator.noise.generator import (
     BLOCK,
     STRIDE,
@@ -113,16 +113,14 @@ class Transitions:
     #: (4, H, W) each, contiguous float32: blurred already, at the exposure of its prepared scene.
     #: Several may be the same. One tensor (B, 4, H, W) where torch is to record the frames.
     light: Lights
-    table: np.ndarray  # (B, 5, 4) of `exposure_table`
-    #: `Exposure.remaining_variance` of each, contiguous float32; None for all of the variance. None
-    #: in place of the sequence where no frame has any.
+    #: (B, 5, 4) float32, columns are the planes R, G1, G2, B. The rows: exposure ratio; shot and
+    #: read noise that is missing, negative where the source has more; shot and read noise of the
+    #: source on the target's scale.
+    table: np.ndarray
+    #: (H, W) contiguous float32 each: shares of the source's noise variance that blurs leave,
+    #: beyond what is in the `table`; None for all of it. None in place of the sequence where no
+    #: frame has any.
     remaining_variance: Sequence[torch.Tensor | None] | None = None
-
-    @classmethod
-    def of(cls, lights: Sequence[torch.Tensor], exposures: Sequence[Exposure]) -> Transitions:
-        """Those of lights that are blurred already."""
-        shares = [exposure.remaining_variance for exposure in exposures]
-        return cls([light.contiguous() for light in lights], exposure_table(exposures), shares)
 
     def in_bands(self, row_gain: np.ndarray) -> Transitions:
         """The same where rows have light of their own: the bands of flickering light.
@@ -205,22 +203,6 @@ class Transitions:
         return any(share is not None for share in self.shares())
 
 
-def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
-    """Exposures as the columns of a batch: (B, 5, 4) float32, columns are the planes R, G1, G2, B.
-
-    The rows: exposure ratio; shot and read noise that is missing, negative where the source has
-    more; shot and read noise of the source on the target's scale.
-    """
-    pairs = [(exposure.source_noise, exposure.target) for exposure in exposures]
-    rows = [t.shot + t.read + s.shot + s.read for s, t in pairs]  # flat: numpy reads them faster
-    noises = np.array(rows).reshape(-1, 4, 4)
-    noises[:, :2] -= noises[:, 2:]  # in float64: both may be nearly the same
-    table = np.empty((len(exposures), 5, 4), np.float32)
-    table[:, 0] = np.array([exposure.ratio for exposure in exposures])[:, None]
-    table[:, 1:] = noises
-    return table
-
-
 def missing_variance(
     signal: torch.Tensor,
     table: np.ndarray | Sequence[torch.Tensor],
@@ -230,8 +212,8 @@ def missing_variance(
 
     Args:
         signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
-        table: (4, 4), rows 1 to 4 of `exposure_table`, or (4,), its column for that plane; or four
-            tensors for rows.
+        table: (4, 4), rows 1 to 4 of a `Transitions.table`, or (4,), its column for that plane; or
+            four tensors for rows.
         remaining_variance: (H, W) share of the source's variance that a blur left; None for all.
     """
     shot, read, source_shot, source_read = (
@@ -298,11 +280,6 @@ def record(
 
 
 # -- the steps one by one ---------------------------------------------------------------------
-
-
-def exposed_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
-    """Light on the sensor, (4, H, W), of `light` that has the blur of `exposure` already."""
-    return (light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
 
 def record_stepwise(

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from simulator.camera import BayerPattern, CameraProfile
-from simulator.capture.decision import SIGNAL_LIMIT
+from simulator.capture.limits import SIGNAL_LIMIT
 from simulator.capture.sensor import clip_and_quantise, pixel_response
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import plane_tensor

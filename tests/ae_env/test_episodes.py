@@ -21,7 +21,7 @@ from ae_env.scenes.load import _LOADED
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import SceneCaptures, prepare_scene
 from simulator.camera import get_camera
-from simulator.capture.sensor import clip_and_quantise, exposed_light
+from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.generator import frame_normals, noise_keys
 from simulator.noise.noise_level_function import ReadNoise
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
@@ -75,12 +75,10 @@ def test_frames_are_those_of_the_simulator(noise, tolerance, lighting):
             scene = core.scenes[episode.scene]
             prepared = replace(prepare_scene(scene, core.camera, **episode.moves), gain=gain)
             prepared = replace(prepared, tolerance=tolerance)
-            exposure = prepared.exposure(state)
-            light = exposed_light(prepared.blurred_light.blurred(exposure), exposure)
-            light = light.double().numpy()
+            light = prepared.expected(state).double().numpy()
             key = int(noise_keys(episode.noise_seed, episode.frame)[0])
             normals = frame_normals(key, (4, 36, 36), noise)
-            nlf = exposure.target
+            nlf = core.camera.nlf(state.iso).scaled(1.0 / prepared.box_factor**2)
             shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
             read = read - 1.0 / (12.0 * span**2)  # what rounding adds
             variance = np.maximum(np.maximum(light, 0) * shot + read, 0)

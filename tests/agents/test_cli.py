@@ -29,7 +29,7 @@ from agents.cli.evaluate import make_plan
 from agents.learning.policy_file import load_agent
 from agents.viewer.viewed_scene import find_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
-from simulator.capture.decision import DEFAULT_TOLERANCE
+from simulator.capture.limits import DEFAULT_TOLERANCE
 from simulator.networks.weights import build_modules, load_modules, save_modules
 from simulator.raw.develop import upright_picture
 from simulator.training import scenes as pictures

@@ -213,7 +213,7 @@ def test_bfloat16_is_close_to_float32(compact: CameraSimulator) -> None:
     half.noises, raw = compact.noises, noisy_raw()
     for tolerance, error in ((0.1, 0.012), (0.01, 0.0)):  # 0.012 of its own noise is more than 0.01
         plans = [s.plan(raw, SOURCE, noise=False, tolerance=tolerance) for s in (compact, half)]
-        exact, rounded = (plan.exposure.denoised.light for plan in plans)
+        exact, rounded = (plan.denoised.light for plan in plans)
         assert torch.equal(exact, rounded) is (error == 0.0)
         assert (exact - rounded).abs().mean() < 0.02 * (exact - raw.data).abs().mean()
         assert plans[1].errors["rounding"] == pytest.approx(error, rel=0.01, abs=1e-3)

@@ -16,15 +16,21 @@ from simulator.capture import blurred_frames
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
-from simulator.capture.columns import plan_sweep
-from simulator.capture.decision import Exposure
-from simulator.capture.plan import noise_balance, predict_errors
-from simulator.capture.sensor import Transitions, exposure_table, record
+from simulator.capture.columns import Planned, noise_columns, plan_captures, remaining_map
+from simulator.capture.plan import noise_balances
+from simulator.capture.sensor import record
 from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.noise.generator import noise_keys
 from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur, disc_kernel
-from simulator.optics.motion import Movement, motion_blur, motion_kernel, path_blur, path_taps
+from simulator.optics.motion import (
+    Movement,
+    Path,
+    motion_blur,
+    motion_kernel,
+    path_blur,
+    path_taps,
+)
 from simulator.optics.vignetting import Vignetting
 from simulator.utils.tiles import make_tiles
 
@@ -110,7 +116,6 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(size, tile, monkeypa
 
 # -- uniform blur in sweeps -------------------------------------------------------------------
 
-STILL = Exposure(2.0, ZERO, ZERO)
 LIGHT = torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(0))
 CLEAN = DenoisedLight(LIGHT * 0.5)
 
@@ -118,26 +123,27 @@ CLEAN = DenoisedLight(LIGHT * 0.5)
 @pytest.mark.parametrize("denoised", [False, True])
 def test_disc_then_streak(denoised: bool) -> None:
     source = CLEAN.light if denoised else LIGHT
-    blurred_light = BlurredLight(LIGHT, ZERO, None)
-    exposure = replace(STILL, denoised=CLEAN if denoised else None)
-    assert blurred_light.blurred(exposure) is source  # what needs no blur is not copied
-    exposure = replace(exposure, defocus_px=2.0, motion_px=3.0)
+    blurred_light, blur = BlurredLight(LIGHT, ZERO, None), np.zeros(1, blurred_frames.BLUR)
+    given = [(CLEAN if denoised else None, None)], blur, (None, None)
+    assert blurred_light.lights(*given)[0] is source  # what needs no blur is not copied
+    blur["defocus_px"], blur["motion_px"], blur["streaks"] = 2.0, 3.0, True
     expected = motion_blur(disc_blur(source, 2.0), 3.0)
-    found = blurred_light.blurred(exposure)
+    (found,) = blurred_light.lights(*given)
     assert torch.equal(found, expected)
-    assert blurred_light.blurred(replace(exposure, ratio=4.0)) is found  # made once
+    assert blurred_light.lights(*given)[0] is found  # made once
 
 
 def test_noise_that_opening_and_motion_leave() -> None:
     opens = MapApertureBlur(LIGHT, torch.full((24, 20), 2.0), 8.0)
     alone = opens.remaining_variance(4.0)
-    noisy = Exposure(1.0, Z6.nlf(800), Z6.nlf(800), opened_to=4.0)
-    lights = BlurredLight(LIGHT, Z6.nlf(800), opens)
-    assert torch.equal(lights.with_remaining_noise(noisy).remaining_variance, alone)
-    moving = lights.with_remaining_noise(replace(noisy, motion_px=3.0))
-    left = (alone / moving.energy).clamp(max=1.0)
-    assert torch.equal(moving.remaining_variance, left)
-    assert 0.2 < moving.energy < 0.5  # of a streak of three pixels
+    blur, scene = np.zeros(1, blurred_frames.BLUR), PreparedScene(LIGHT, REFERENCE, Z6, Z6.nlf(800))
+    scene = replace(scene, aperture_blur=opens)
+    assert torch.equal(remaining_map(scene, blur[0], 4.0, True), alone)
+    blur["motion_px"], blur["streaks"] = 3.0, True
+    energy = scene.blurred_light.remaining_energy(blur[0], None)
+    left = (alone / energy).clamp(max=1.0)
+    assert torch.equal(remaining_map(scene, blur[0], 4.0, True), left)
+    assert 0.2 < energy < 0.5  # of a streak of three pixels
 
 
 # -- scenes with a layout, in motion ------------------------------------------------------------
@@ -147,6 +153,16 @@ SIZE = 32
 SCENE = torch.rand(4, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
 MOVEMENT = Movement(0.6, 2.0, subject_speed=0.4, subject_direction=2.0)
 SLOW = CameraSettings(100, 1 / 2, 8)
+
+
+SLOW_RATIO = 1.0  # three stops less gain, five more light, two less through the aperture
+SHAKE = Path(0.3 * 0.5 * SIZE, 0.6, 2.0 * 0.5)
+DRIFT = 0.4 * 0.5 * SIZE
+OWN = SHAKE._replace(drift_x=DRIFT * math.cos(2.0), drift_y=DRIFT * math.sin(2.0))
+
+
+def planned(scene: PreparedScene) -> Planned:
+    return plan_captures(scene, [SLOW], np.ones(1), noise=True)
 
 
 def _layout() -> Layout:
@@ -166,17 +182,15 @@ def _prepared(noisy=False, **fields):
 
 def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
     whole = Layout(torch.zeros(SIZE, SIZE))
-    exposure = _prepared(layout=whole, image_speed=0.3).exposure(SLOW)
-    path = MOVEMENT.path(0.3, 0.5, SIZE)
-    assert (exposure.path, exposure.subject_path, exposure.layout) == (path, None, None)
-    assert exposure.motion_px == pytest.approx(0.3 * 0.5 * SIZE)
+    (blur,) = planned(_prepared(layout=whole, image_speed=0.3)).blurs
+    assert [blur[n].item() for n in ("extent", "direction", "turn", "mask")] == [*SHAKE[:3], 0]
+    assert blur["motion_px"] == pytest.approx(0.3 * 0.5 * SIZE)
     found = _prepared(layout=None, image_speed=0.3).expected(SLOW)
-    wanted = path_blur(SCENE, path_taps(path, SIZE, SIZE)) * exposure.ratio
-    torch.testing.assert_close(found, wanted)
+    torch.testing.assert_close(found, path_blur(SCENE, path_taps(SHAKE, SIZE, SIZE)))
     along_rows = _prepared(layout=None, movement=Movement(subject_speed=2.0), image_speed=0.3)
     plain = PreparedScene(SCENE, REFERENCE, Z6, ZERO, image_speed=0.3)
     assert torch.equal(plain.expected(SLOW), along_rows.expected(SLOW))
-    assert along_rows.exposure(SLOW).path is None
+    assert planned(along_rows).blurs["streaks"].all()
 
 
 @pytest.mark.parametrize("defocus", [0.0, 5.0])
@@ -185,23 +199,20 @@ def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
 def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement) -> None:
     """The variance of blurred white noise, over many draws."""
     scene = _prepared(noisy=True, defocus=defocus, image_speed=speed, movement=movement)
-    exposure = scene.exposure(SLOW)
-    if exposure.layout is None and exposure.path is None:
-        assert exposure.remaining_variance is None
-        return
-    left, share = exposure.remaining_variance, torch.full((SIZE, SIZE), exposure.energy)
-    share = share if left is None else left * share
+    (blur,), (left,), (table,) = (found := planned(scene))[1], found.shares, found.table
+    share = table[3].item(0) / (SLOW_RATIO * Z6.nlf(800).shot[0])
+    share = torch.full((SIZE, SIZE), share) if left is None else share * left
     draws = torch.randn(600, SIZE, SIZE, generator=torch.Generator().manual_seed(3))
     blurred = []
     for planes in draws.reshape(-1, 4, SIZE, SIZE):
         made = PreparedScene(planes, REFERENCE, Z6, ZERO, tolerance=0.0)
         same = replace(made, defocus=defocus, image_speed=speed, movement=movement)
         same = replace(same, layout=scene.layout)
-        blurred.append(same.blurred_light.blurred(exposure))
+        blurred.append(same.expected(SLOW))
     measured = torch.cat(blurred).double().square().mean(dim=0)
     ratio = (measured / share)[6:-6, 6:-6]  # replicated borders average less
     assert float(ratio.min()) > 0.75
-    if exposure.subject_path is not None:
+    if blur["mask"] and speed + movement.subject_speed > 0.0:
         # What continues behind the subject repeats pixels, and their noise with them.
         assert float(ratio.mean()) < 1.25
         ratio = ratio[:, :4]
@@ -223,11 +234,10 @@ def test_whole_captures_by_hand() -> None:
         np.add.at(dense, (taps.rows + reach, taps.columns + reach), taps.weights)
         return dense
 
-    shake = kernel(MOVEMENT.path(0.3, 0.5, SIZE))
-    own = kernel(MOVEMENT.subject_path(0.3, 0.5, SIZE))
+    shake, own = kernel(SHAKE), kernel(OWN)
     mask, behind = layout.subject.numpy(), layout.behind.numpy()
     cover = correlate(mask.astype(float), own, mode="nearest")
-    found = scene.expected(SLOW) / scene.exposure(SLOW).ratio
+    found = scene.expected(SLOW)
     for plane, result in zip(light, found, strict=True):
         wanted = (1.0 - cover) * correlate(plane.ravel()[behind], shake, mode="nearest")
         wanted += correlate(mask * plane, own, mode="nearest")
@@ -311,13 +321,16 @@ def photographed(batch, states, gains=(1.0,) * 10, **options):
 
 
 def alone(scene, state, gain, key, noise="bank"):
-    exposure, frame = scene.exposure(STATES[state], gain=gain), torch.empty(1, 4, 24, 20)
-    transitions = Transitions.of([scene.blurred_light.blurred(exposure)], [exposure])
+    """Its capture, the samples that are clipped, and the excess of its noise."""
+    frame, states = torch.empty(1, 4, 24, 20), STATES[state : state + 1]
+    if key is None:  # the light has no pattern of the sensor
+        scene = scene.changed(camera=Z6)
+    ((_, found),) = scene.transitions(states, gain=np.array([gain]))
+    fixed = found.shares(), found.table, noise_columns(Z6, states, 1)
+    excess, _ = noise_balances([found.light[0]], *fixed)
     keys = None if key is None else np.array([key], np.uint64)
-    if key is not None:
-        transitions = transitions.seen_by([scene.response])
-    counts = record(transitions, Z6, keys=keys, noise=noise, signals=frame, count=True)
-    return frame[0].numpy(), counts[0], exposure
+    counts = record(found, Z6, keys=keys, noise=noise, signals=frame, count=True)
+    return frame[0].numpy(), counts[0], excess.item()
 
 
 @pytest.mark.parametrize("noise", ["bank", "exact", None])
@@ -335,29 +348,23 @@ def test_frames_are_those_of_each_scene_alone(noise, light_bytes, monkeypatch):
         frames, found = photographed(batch, states, gains)
         for i in range(10):
             key = None if noise is None else int(KEYS[i])
-            wanted, counts, exposure = alone(shown[i], states[i], gains[i], key, noise or "bank")
+            wanted, counts, excess = alone(shown[i], states[i], gains[i], key, noise or "bank")
             np.testing.assert_array_equal(frames[i], wanted)
             clipped = found.clipped_low[i], found.clipped_high[i]
             assert clipped == tuple(counts / wanted.size)
             assert clipped == ((wanted <= 2.0**-10).mean(), (wanted == 1.0).mean())
-            modules = ["exposure", *["noise_reduction"] * (exposure.denoised is not None)]
-            modules += ["aperture"] * (exposure.opened_to is not None)
-            modules += ["defocus"] * (exposure.defocus_px > 0)
-            modules += ["motion_blur"] * (exposure.motion_px > 0)
-            modules += ["vignetting"] * (exposure.vignetting is not None)
-            modules += ["pixel_response"] * (noise is not None and shown[i].response is not None)
-            modules += ["noise"] * bool(noise)
-            assert MODULES[found.modules[i]] == "+".join(modules)
+            scene = shown[i].changed(gain=gains[i], camera=camera if noise else Z6)
+            modules = [*scene.plan(STATES[states[i]]).modules]
+            assert modules.pop() == "clip_and_quantise"
+            modules += ["noise"] * ("noise" not in modules)
+            assert MODULES[found.modules[i]] == "+".join(modules if noise else modules[:-1])
             seen |= set(modules)
-            balance = noise_balance(shown[i].blurred_light.blurred(exposure), exposure)
-            excess = balance[0] if noise else 0.0
+            excess = excess if noise else 0.0
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
-            seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
-            if not shown[i].nlf.is_zero:
-                if noise is None:  # the error is that of the light alone
-                    exposure = shown[i].exposure(STATES[states[i]], noise=False, gain=gains[i])
-                errors = predict_errors(shown[i], STATES[states[i]], exposure)
-                assert found.predicted_error[i] == pytest.approx(math.hypot(*errors.values()))
+            seen |= {"excess"} if excess > 0.1 and "aperture" in modules else set()
+            if not shown[i].nlf.is_zero:  # without noise, the error is that of the light alone
+                plan = scene.plan(STATES[states[i]], noise=bool(noise))
+                assert found.predicted_error[i] == pytest.approx(plan.predicted_error)
     assert seen >= {"noise_reduction", "aperture", "defocus", "motion_blur", "vignetting"}
     assert sorted(call.args[0] for call in scenes.call_args_list) == list(range(10))
     assert noise is None or seen >= {"noise", "excess"}
@@ -371,20 +378,18 @@ def test_a_sweep_is_planned_as_each_state_alone(noise) -> None:
     )
     opens = NetworkApertureBlur(family[2], lambda image, *_: 0.9 * image, 4.0)
     scenes = [replace(prepared(1), denoised_lights=family, tolerance=0.1 * i) for i in range(4)]
-    plan_sweep(scenes[3], STATES[-1:] * 2, np.ones(2), noise=True)
+    plan_captures(scenes[3], STATES[-1:], np.ones(1), noise=True)
     assert not any(network.shape for network in family)  # none has run: the target is noisier
     scenes += [replace(scene, aperture_blur=opens) for scene in scenes]
     for scene in (*map(prepared, range(10)), *scenes):
-        origins, blurs, table, left = plan_sweep(scene, STATES, np.full(6, 0.5), noise=noise)
+        sweep = plan_captures(scene, STATES, np.full(6, 0.5), noise=noise)
         for i, state in enumerate(STATES):
-            exposure = scene.exposure(state, noise=noise, gain=0.5)
-            assert origins[i] == exposure.origin
-            assert blurs[i]["defocus_px"] == exposure.defocus_px
-            assert blurs[i]["motion_px"] == exposure.motion_px
-            np.testing.assert_allclose(table[i], exposure_table([exposure])[0], rtol=1e-6)
-            shares = None if left is None else left[i], exposure.remaining_variance
-            assert (shares[0] is None) == (shares[1] is None)
-            assert shares[0] is None or torch.equal(*shares)
+            alone = plan_captures(scene, [state], np.full(1, 0.5), noise=noise)
+            for name in ("blurs", "table", "details"):
+                np.testing.assert_array_equal(getattr(sweep, name)[i], getattr(alone, name)[0])
+            assert [sweep.origins[i]] == alone.origins
+            shares = sweep.shares[i], *alone.shares
+            assert shares[0] is shares[1] is None or torch.equal(*shares)
 
 
 def test_wide_discs_and_frames_that_others_ask_for(monkeypatch) -> None:
@@ -395,11 +400,9 @@ def test_wide_discs_and_frames_that_others_ask_for(monkeypatch) -> None:
     for states in (0, 1):
         batch.prepare(SCENES, np.full(10, 4), np.ones(10))  # and no `record`
         frames, _ = photographed(batch, states)
-        exposure = scene.exposure(STATES[states])
-        light = [scene.blurred_light.blurred(exposure)] * 10
-        wanted = np.empty_like(frames)
-        record(Transitions.of(light, [exposure] * 10), Z6, keys=KEYS, noise="bank", signals=wanted)
-        np.testing.assert_array_equal(frames, wanted)
+        for i, frame in enumerate(frames):
+            wanted, *_ = alone(scene, states, 1.0, int(KEYS[i]))
+            np.testing.assert_array_equal(frame, wanted)
 
 
 def test_forgotten_scenes_are_asked_for_again() -> None:

@@ -13,12 +13,13 @@ from simulator.capture import plan as plan_module
 from simulator.capture import statistics
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import ApertureBlur, MapApertureBlur
-from simulator.capture.decision import Exposure
+from simulator.capture.columns import ERRORS as PARTS
+from simulator.capture.columns import KEPT_BLUR_ERROR, MISSED_BLUR, plan_captures
 
 # The factors and the least bound were measured; the tests hold the arithmetic that uses them.
-from simulator.capture.plan import _BOUND, _LEAST_BOUND, KEPT_BLUR_ERROR, MISSED_BLUR
+from simulator.capture.plan import _BOUND, _LEAST_BOUND
 from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
-from simulator.optics.motion import Movement
+from simulator.optics.motion import Movement, path_length
 
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)
@@ -117,22 +118,23 @@ def test_operations_and_time_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Statistics(LightStatistics):
-    """Errors by hand: of noise, and of a disc and a streak of one pixel."""
+    """Errors by hand: of noise, and of a disc and a streak of one pixel.
+
+    For a target of variance 1, of a source whose variance is its light: one bin of the light that
+    makes `noise` be the error. A disc moves a pixel by a 32nd of the Laplacian, a streak by a 24th.
+    """
+
+    columns = noise_columns = np.empty(0)
 
     def __init__(self, noise: float = 0.0, disc: float = 0.0, streak: float = 0.0) -> None:
-        self.noise, self.blur = noise, (disc, streak)
-
-    def excess_error(self, *_: object) -> float:
-        return self.noise
-
-    relative_noise = excess_error
-
-    def curvature(self, *_: object) -> tuple[float, float]:
-        return self.blur
+        self.columns, self.noise_columns = np.zeros((2, 4, 4, statistics.BINS))
+        self.columns[:, :, 0] = [[0.25], [0.0], [(32.0 * disc) ** 2], [(24.0 * streak) ** 2]]
+        self.noise_columns[:, :, 0] = [[0.25], *[[(1.0 + noise) ** 2]] * 2, [noise**2]]
 
 
 #: A flat field of unit noise: a network's error there is that of its first knot.
 UNIT = NoiseLevelFunction((0.0,) * 4, (1.0,) * 4)
+SHOT = NoiseLevelFunction((1.0,) * 4, (0.0,) * 4)
 FLAT = statistics.ResidualStatistics(torch.ones(4, 16, 16), UNIT)
 
 
@@ -151,20 +153,32 @@ class Opening(ApertureBlur):
         return LIGHT
 
 
-def decided(tolerance, found, networks=(), *, opened_px=None, noise=True, nlf=(UNIT, UNIT), **rest):
-    """What is decided where the noise's variance is 1; by default with a network without error."""
+def posed(tolerance, found, networks=(), *, opened_px=None, source=SHOT, **rest):
+    """A scene in which noise of variance 1 is wanted; by default with a network without error."""
     exact = DenoisedLight(LIGHT)
     exact.statistics = found
     if opened_px is not None:
         rest["aperture_blur"] = Opening(opened_px)
     rest |= {"denoised_lights": networks or (exact,), "tolerance": tolerance}
-    scene = PreparedScene(LIGHT, SOURCE, Z6.with_nlf(SOURCE.iso, nlf[1]), nlf[0], **rest)
+    scene = PreparedScene(LIGHT, SOURCE, Z6.with_nlf(SOURCE.iso, UNIT), source, **rest)
     scene.blurred_light.statistics, scene.blurred_light.residuals = found, FLAT
-    return scene.exposure(SOURCE, noise=noise)
+    return scene
 
 
-def steps(*given, **options):
-    return decided(*given, **options).steps
+def decided(*given, noise=True, **options):
+    """What is decided at the settings of the source."""
+    return plan_captures(posed(*given, **options), [SOURCE], np.ones(1), noise=noise)
+
+
+def errors(made) -> dict[str, float]:
+    """Of leaving out each step, and of the network."""
+    return dict(zip(PARTS[:5], made.details[0].tolist(), strict=False))
+
+
+def runs(made) -> list[str]:
+    ((network, opened),), (blur,) = made.origins, made.blurs
+    ran = network is not None, opened is not None, blur["defocus_px"] > 0, blur["motion_px"] > 0
+    return [name for name, runs in zip(PARTS, ran, strict=False) if runs]
 
 
 #: A disc, and a streak along the rows, of so many pixels at `SOURCE`.
@@ -177,7 +191,8 @@ def streak(extent: float) -> dict[str, float]:
 
 
 def left_out(made):
-    return [step.name for step in made if not step.runs and step.error]
+    some = list(errors(made).items())[:4]
+    return [name for name, error in some if error and name not in runs(made)]
 
 
 FAMILY = (network("nano", 0.4), network("compact", 0.2), network("large", 0.1))
@@ -193,94 +208,95 @@ FAMILY = (network("nano", 0.4), network("compact", 0.2), network("large", 0.1))
 @pytest.mark.parametrize("noise", [True, False])
 def test_the_cheapest_network_within_the_tolerance_or_else_the_best(tolerance, name, noise):
     """The noise would be an error of 0.6, the networks of 0.4, 0.2, 0.1."""
-    step = steps(tolerance, Statistics(0.6), FAMILY, noise=noise)[0]
-    assert (step.network.name if step.network else None) == name
-    assert step.runs is (name is not None)
-    assert step.error == 0.6
-    errors = {"nano": 0.4, "compact": 0.2, "large": 0.1, None: 0.0}
-    assert step.residual == pytest.approx(errors[name])
+    made = decided(tolerance, Statistics(0.6), FAMILY, noise=noise)
+    ((network, _),) = made.origins
+    assert (network.name if network else None) == name
+    assert errors(made)["noise_reduction"] == pytest.approx(0.6)
+    own = {"nano": 0.4, "compact": 0.2, "large": 0.1, None: 0.0}
+    assert errors(made)["network"] == pytest.approx(own[name])
 
 
 def test_a_larger_network_or_any_may_be_the_worse_one() -> None:
     odd = (network("nano", 0.4), network("compact", 0.1), network("large", 0.2))
     for tolerance, name in ((0.25, "compact"), (0.05, "compact"), (0.0, "compact")):
-        chosen = steps(tolerance, Statistics(0.6), odd)[0].network
-        assert chosen.name == name
+        assert posed(tolerance, Statistics(0.6), odd).plan(SOURCE).network == name
     for tolerance in (0.0, 0.04, 0.06):  # noise that errs by less than all of them stays
-        assert steps(tolerance, Statistics(0.05), odd)[0].network is None
-    assert "no network would make" in steps(0.04, Statistics(0.05), odd)[0].reason
+        plan = posed(tolerance, Statistics(0.05), odd).plan(SOURCE)
+        assert plan.network is None
+    plan = posed(0.04, Statistics(0.05), odd).plan(SOURCE)
+    assert "no network would make" in plan.left_out["noise_reduction"]
 
 
 def test_noise_and_blur_add_as_squares() -> None:
     """3, 4, 5: a blur of 0.4 fits beside noise of 0.3 within 0.5, and nothing more does."""
     found = Statistics(0.3, disc=0.4, streak=1e-3)
-    assert left_out(steps(0.5, found, **disc(1.0))) == ["noise_reduction", "defocus"]
-    made = steps(0.5, found, **disc(1.0), **streak(1.0))
-    assert [step.runs for step in made] == [False, False, False, True]
-    assert left_out(steps(0.29, found, **disc(1.0))) == []
-    assert left_out(steps(0.4999, Statistics(0.5))) == []
-    for error, runs in ((0.41, True), (0.39, False)):  # beside a network that errs by 0.3
+    assert left_out(decided(0.50001, found, **disc(1.0))) == ["noise_reduction", "defocus"]
+    assert runs(decided(0.50001, found, **disc(1.0), **streak(1.0))) == ["motion_blur"]
+    assert left_out(decided(0.29, found, **disc(1.0))) == []
+    assert left_out(decided(0.4999, Statistics(0.5))) == []
+    for error, ran in ((0.41, ["defocus"]), (0.39, [])):  # beside a network that errs by 0.3
         own = network("nano", 0.3)
         own.statistics = Statistics(disc=error)
-        made = steps(0.5, Statistics(0.9), (own,), **disc(1.0))
-        assert [made[0].runs, made[2].runs] == [True, runs]
+        made = decided(0.5, Statistics(0.9), (own,), **disc(1.0))
+        assert runs(made) == ["noise_reduction", *ran]
 
 
 def test_missing_blurs_add_up_in_the_mean() -> None:
     """0.3 and 0.4 shift a pixel by up to 0.7; the second adds sqrt(0.49 - 0.09) to the square."""
     found = Statistics(disc=0.1, streak=0.4)
-    made = steps(0.7, found, opened_px=3**0.5, **streak(1.0))
+    made = decided(0.70001, found, opened_px=3**0.5, **streak(1.0))
     assert left_out(made) == ["aperture", "motion_blur"]
-    assert made[3].error == pytest.approx(math.sqrt(0.4))
-    assert math.hypot(*(step.error for step in made)) == pytest.approx(0.7)
+    assert errors(made)["motion_blur"] == pytest.approx(math.sqrt(0.4))
+    assert math.hypot(*errors(made).values()) == pytest.approx(0.7)
     # Errors go with the square of the extent: 0.9 does not fit.
-    assert left_out(steps(0.7, found, opened_px=3.0)) == []
+    assert left_out(decided(0.7, found, opened_px=3.0)) == []
 
 
 def test_a_blur_that_runs_takes_nothing_of_the_tolerance() -> None:
-    made = steps(0.2, Statistics(disc=0.05, streak=0.2), opened_px=10, **disc(2))
+    made = decided(0.20001, Statistics(disc=0.05, streak=0.2), opened_px=10, **disc(2))
     assert left_out(made) == ["defocus"]
-    assert [step.error for step in made] == [0.0, pytest.approx(5.0), pytest.approx(0.2), 0.0]
-    assert [step.extent for step in made] == [0.0, 10, 2, 0.0]
+    assert [*errors(made).values()] == pytest.approx([0.0, 5.0, 0.2, 0.0, 0.0])
+    assert made.details[0, len(PARTS) :].tolist() == [10, 2, 0.0]
 
 
 def test_no_network_runs_for_the_errors_of_blur_that_nobody_asks_for() -> None:
     """The paper's aperture module needs the denoised light; its own blur is not known before."""
-    nlf, found = (Z6.nlf(6400), Z6.nlf(100)), Statistics(5.0, disc=0.01)
+    noisy, found = NoiseLevelFunction((0.0,) * 4, (9.0,) * 4), Statistics(disc=0.01)
     lazy = DenoisedLight(lambda: pytest.fail("it ran"))
-    opens = {"aperture_blur": Opening(math.inf, needs_denoised=True), "nlf": nlf}
-    made = steps(0.1, found, (lazy,), **opens)
-    assert [step.runs for step in made] == [True, True, False, False]
-    assert "works on the noise-reduced light only" in made[0].reason
-    assert made[1].reason == "the aperture opens and adds blur"
-    assert made[1].error == math.inf
-    assert steps(0.1, found, (lazy,), nlf=nlf)[0].runs
+    opens = {"aperture_blur": Opening(math.inf, needs_denoised=True), "source": noisy}
+    made = decided(0.1, found, (lazy,), **opens)
+    assert runs(made) == ["noise_reduction", "aperture"]
+    assert errors(made)["aperture"] == math.inf
+    assert runs(decided(0.1, found, (lazy,), source=noisy)) == ["noise_reduction"]
     lazy.statistics = Statistics(disc=0.02)
-    blurred = steps(0.1, found, (lazy,), **opens, **disc(2.0))
-    assert blurred[2].error == pytest.approx(0.08)  # of the light that is blurred
+    blurred = decided(0.1, found, (lazy,), **opens, **disc(2.0))
+    assert errors(blurred)["defocus"] == pytest.approx(0.08)  # of the light that is blurred
+    reasons = posed(0.1, found, **opens).plan(SOURCE).details()
+    assert "runs noise_reduction: the aperture module works on the noise-reduced" in reasons
+    assert "runs aperture: the aperture opens and adds blur\n" in reasons
 
 
 def test_the_exposure_has_what_runs() -> None:
-    """Of blur that is left out, neither extent nor path nor layout stays."""
+    """Of blur that is left out, no extent stays."""
     subject = torch.arange(20).expand(16, 20) > 9
     layout, movement = Layout(torch.ones(16, 20), subject), Movement(0.5, 0.0, 4.0)
     blurs = {**disc(2.0), **streak(4.0), "layout": layout, "movement": movement}
-    own = movement.subject_path(16.0, 1 / 64, 16)
-    paths = movement.path(16.0, 1 / 64, 16), own
+    drift = math.cos(0.0), math.sin(0.0)  # 4 frame heights of 16 pixels in 1 / 64 s
+    length = path_length(4.0, 0.5, 0.0, *drift)
     for point, row in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0)):
         found = Statistics(disc=point, streak=3 / 4 * row)  # a path's bound is that of a disc
         made = decided(0.1, found, (network("a", 0.0),), **blurs)
         moves = point > 0.0
-        assert (made.defocus_px, made.motion_px) == (2.0 * moves, own.length * moves)
-        assert (made.path, made.subject_path) == (paths if moves else (None, None))
-        assert made.layout is (layout if moves else None)
-        assert (made.ratio, made.source, made.denoised, made.opened_to) == (1.0, UNIT, None, None)
+        extents = made.blurs[["defocus_px", "motion_px", "drift_x", "drift_y"]].tolist()
+        assert extents == [pytest.approx((2.0 * moves, length * moves, *drift))]
+        assert made.origins == [(None, None)]
+        assert made.table[0, :, 0].tolist() == [1.0, -1.0, 1.0, 1.0, 0.0]
     exact = network("a", 0.0)
-    exact.statistics = Statistics(9, 9)
-    made = decided(0.1, Statistics(9, 9), (exact,), opened_px=9.0)
-    assert (made.opened_to, made.source.is_zero, made.denoised) == (8.0, True, exact)
-    assert made.left_out == 0.0
-    assert Exposure(1.0, UNIT, UNIT).left_out == 0.0
+    exact.statistics = Statistics(2, 9)
+    made = decided(0.1, Statistics(2, 9), (exact,), opened_px=9.0)
+    assert made.origins == [(exact, 8.0)]
+    assert made.table[0, :, 0].tolist() == [1.0, 0.0, 1.0, 0.0, 0.0]
+    assert left_out(made) == []
 
 
 @pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER])

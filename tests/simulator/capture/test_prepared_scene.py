@@ -14,7 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
-from simulator.capture import prepared_scene
+from simulator.capture import columns, prepared_scene
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
 from simulator.capture.sensor import clip_and_quantise
@@ -70,9 +70,10 @@ def prepared(level=0.2, reference=HIGH, **changes):
 )
 def test_denoised_light_is_used_where_the_source_is_noisier(reference, target, denoised):
     source = prepared(reference=reference)
-    exposure = source.exposure(target)
-    assert (exposure.denoised is not None) is exposure.source.is_zero is denoised
-    assert torch.equal(source.blurred_light.source(exposure.origin), flat(0.2)) is denoised
+    planned = planned_for(source, target)
+    assert (planned.origins[0][0] is not None) is denoised
+    assert planned.table[0, 3:].any() != denoised
+    assert torch.equal(source.blurred_light.source(planned.origins[0]), flat(0.2)) is denoised
     frame, excess = source.capture(target, 3)
     assert excess == source.plan(target).excess_noise == 0.0
     wanted = expected_variance(0.2, Z6.nlf(target.iso)) + ROUNDING
@@ -89,7 +90,7 @@ def test_light_without_noise_takes_none_of_the_sources(tolerance: float, denoise
     noisy, clean = flat(0.2) + 1e-3, DenoisedLight(flat(0.2))
     fields = {"denoised_lights": (clean,), "tolerance": tolerance}
     source = PreparedScene(noisy, low, body, body.nlf(100), **fields)
-    assert source.exposure(high).denoised is None  # the target's noise hides it
+    assert source.plan(high).network is None  # the target's noise hides it
     assert torch.equal(source.expected(high), clean.light if denoised else noisy)
     plan = source.plan(high, noise=False)
     assert ("noise_reduction" in plan.modules) is denoised
@@ -99,8 +100,12 @@ def test_light_without_noise_takes_none_of_the_sources(tolerance: float, denoise
 def test_noise_is_compared_with_the_averaged_sensors() -> None:
     """A box-averaged source has the target's noise divided by k^2 as well: nothing to remove."""
     nlf = Z6.nlf(6400).scaled(1 / 16)
-    assert not prepared(nlf=nlf, box_factor=4).exposure(HIGH).denoised
-    assert prepared(nlf=Z6.nlf(6400), box_factor=4).exposure(HIGH).denoised
+    assert not prepared(nlf=nlf, box_factor=4).plan(HIGH).network
+    assert prepared(nlf=Z6.nlf(6400), box_factor=4).plan(HIGH).network
+
+
+def planned_for(scene: PreparedScene, settings: CameraSettings) -> columns.Planned:
+    return columns.plan_captures(scene, [settings], np.ones(1), noise=True)
 
 
 def with_detail(source: PreparedScene) -> PreparedScene:
@@ -122,10 +127,9 @@ def test_noise_that_the_blur_removed_is_topped_up(diameter: float, level: float)
     """f/8 to f/4 at the same exposure and ISO: what blur takes of the noise is added again."""
     source = with_aperture_blur(with_detail(prepared(level)), diameter)
     target = CameraSettings(6400, 1 / 256, 4)
-    exposure = source.exposure(target)
-    assert exposure.ratio == 1.0
-    assert exposure.opened_to == 4.0
-    assert not exposure.denoised
+    planned = planned_for(source, target)
+    assert (planned.table[:, 0] == 1.0).all()
+    assert planned.origins == [(None, 4.0)]
     blurred = variance(source.expected(target)[:, 16:-16, 16:-16])
     assert (blurred < 0.75 * expected_variance(level, Z6.nlf(6400))).all()  # it did remove some
     frame, excess = source.capture(target, 9)
@@ -141,10 +145,10 @@ def test_the_papers_network_always_opens_denoised_light() -> None:
     cheap, clean = DenoisedLight(light), DenoisedLight(light)
     small = PreparedScene(light, HIGH, Z6, Z6.nlf(6400), denoised_lights=(cheap, clean))
     source = replace(small, aperture_blur=NetworkApertureBlur(clean, pytest.fail, 8.0))
-    exposure = source.exposure(CameraSettings(6400, 1 / 256, 4))
-    assert (exposure.opened_to, exposure.remaining_variance) == (4.0, None)
-    assert exposure.denoised is clean  # by the best network
-    assert source.exposure(HIGH).denoised is None
+    planned = planned_for(source, CameraSettings(6400, 1 / 256, 4))
+    assert planned.origins == [(clean, 4.0)]  # by the best network
+    assert planned.shares == [None]
+    assert source.plan(HIGH).network is None
 
 
 @pytest.mark.parametrize("factor", [0.98, 1.02])
@@ -160,10 +164,10 @@ def test_blur_of_a_wave_by_hand(blur: str, factor: float) -> None:
     camera = replace(Z6, nlf_by_iso={100.0: noise}, segments=())
     made = PreparedScene(light.expand(4, SIDE, SIDE), settings, camera, NoiseLevelFunction.zero())
     scene = {"defocus": 0.8} if blur == "defocus" else {"image_speed": 0.4 * 64 / SIDE}
-    exposure = replace(made, tolerance=factor * error, **scene).exposure(settings)
-    (found,) = [step.error for step in exposure.steps if step.name == blur]
+    planned = planned_for(replace(made, tolerance=factor * error, **scene), settings)
+    (found,) = planned.details[:, columns.ERRORS.index(blur)]
     assert found == pytest.approx(error, rel=1e-4)
-    applied = exposure.defocus_px if blur == "defocus" else exposure.motion_px
+    (applied,) = planned.blurs["defocus_px" if blur == "defocus" else "motion_px"]
     assert applied == (pytest.approx(0.4) if factor < 1 else 0.0)
 
 

@@ -15,14 +15,13 @@ from scipy.stats import norm
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.capture import sensor
-from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.decision import Exposure
-from simulator.capture.plan import noise_balance
+from simulator.capture.plan import noise_balances
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise, record
 from simulator.noise.generator import frame_normals, noise_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
+from tests.simulator.tables import exposure_table
 from tests.simulator.z6_noise import z6_noise
 
 ISOS, TIMES = (100, 400, 1600, 6400), (1 / 1000, 1 / 125, 1 / 15, 1 / 2)
@@ -31,13 +30,15 @@ AREA = {4: 1 / 16, 5.6: 1 / 32, 8: 1 / 64, 11: 1 / 128}  # exact stops of the ma
 Z6 = get_camera("nikon_z6")
 BLACK, WHITE, SPAN = 1008.0, 15520.0, 14512.0
 ZERO = NoiseLevelFunction.zero()
-STILL = Exposure(1.0, ZERO, ZERO)
 ROWS, COLUMNS = 32, 128  # pixels of one flat patch
 
 
-def sensor_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
-    lights = BlurredLight(light, ZERO, None)
-    return sensor.exposed_light(lights.blurred(exposure), exposure)
+def balance(light, ratio, source, target, share=None) -> tuple[float, bool]:
+    """The excess of noise, and whether any pixel lacks some."""
+    noises = np.array([[target.shot, target.read]])
+    table = exposure_table((ratio, source, target))
+    excess, lacks = noise_balances([light], [share], table, noises)
+    return excess.item(), lacks.item()
 
 
 def exposure_of(settings: CameraSettings) -> float:
@@ -104,20 +105,21 @@ def test_noise_free_source_over_all_states() -> None:
 
 def test_limits_of_light_and_signal() -> None:
     light = torch.tensor([3e6, -3e6, 3e9, -3e9]).expand(4, 1, 4).contiguous()
-    assert sensor_light(light, STILL)[0, 0].tolist() == [1e6, -1e6, 1e6, -1e6]
-    for extents, limit in (({}, 3e3), ({"motion_px": 1e-3}, 1e3), ({"defocus_px": 1e-3}, 1e3)):
-        dark = sensor_light(light, Exposure(1e-6, ZERO, ZERO, **extents))[0, 0]
+    still = CameraSettings(100, 1, 4)
+    scene = PreparedScene(light, still, Z6, ZERO, tolerance=0.0)
+    assert scene.expected(still)[0, 0].tolist() == [1e6, -1e6, 1e6, -1e6]
+    for blur, limit in (({}, 3e3), ({"image_speed": 1e-3}, 1e3), ({"defocus": 1e-3}, 1e3)):
+        dark = replace(scene, gain=1e-6, **blur).expected(still)[0, 0]
         expected = [3.0, -3.0, limit, -limit]  # white at every exposure
         np.testing.assert_allclose(dark.numpy(), expected, rtol=1e-4, atol=1e-3)
-    prepared = PreparedScene(light, CameraSettings(100, 1, 4), Z6, ZERO, gain=1e39)
-    assert prepared.exposure(CameraSettings(100, 1, 4)).ratio == 2.0**107
+    assert replace(scene, gain=1e39).plan(still).ratio == 2.0**107
 
 
 def test_bands_come_before_the_noise() -> None:
     """Each row's light, and of a noisy source each row's share of its variance, by both ways."""
     light, rows = torch.full((4, 2, 5000), 0.3), np.array([[0.5, 1.5]])
-    exposure = Exposure(1.0, Z6.nlf(400), Z6.nlf(6400))
-    transitions, keys = Transitions.of([light], [exposure]), np.array([1], np.uint64)
+    table, keys = exposure_table((1.0, Z6.nlf(400), Z6.nlf(6400))), np.array([1], np.uint64)
+    transitions = Transitions([light], table)
     banded = transitions.in_bands(rows)
     assert banded.light[0][:, :, 0].tolist() == [[pytest.approx(0.15), pytest.approx(0.45)]] * 4
     assert banded.shares()[0][:, 0].tolist() == [0.5, 1.5]
@@ -129,14 +131,14 @@ def test_bands_come_before_the_noise() -> None:
         taken = gain * (source.read[1] + source.shot[1] * 0.3 * gain)
         measured = float(frame[0, 1, row].double().var())
         assert measured == pytest.approx(wanted - taken, rel=5 * math.sqrt(2 / 5000))
-    plain = Transitions.of([light], [Exposure(1.0, ZERO, target)])
+    plain = Transitions([light], exposure_table((1.0, ZERO, target)))
     assert plain.in_bands(rows).shares() == [None]
     for noisy in (replace(source, read=(0.0,) * 4), replace(source, shot=(0.0,) * 4)):
-        (own,) = Transitions.of([light], [Exposure(1.0, noisy, target)]).in_bands(rows).shares()
+        banded = Transitions([light], exposure_table((1.0, noisy, target))).in_bands(rows)
+        (own,) = banded.shares()
         assert own[:, 0].tolist() == [0.5, 1.5]
     share = torch.full((2, 5000), 0.5)
-    blurred = replace(exposure, remaining_variance=share)
-    (known,) = Transitions.of([light], [blurred]).in_bands(rows).shares()
+    (known,) = Transitions([light], table, [share]).in_bands(rows).shares()
     assert known[:, 0].tolist() == [0.25, 0.75]
     assert plain.in_bands(np.ones((1, 2))).light[0] is plain.light[0]
     assert plain.in_bands(np.full((1, 2), 2.0)).light[0].max().item() == pytest.approx(0.6)
@@ -159,14 +161,13 @@ def test_balance_of_noise_pixel_by_pixel(target: NoiseLevelFunction, blurred_noi
     light = rng.normal(0.2, 0.3, (4, 20, 30))
     share = rng.random((20, 30)) if blurred_noise else np.ones((20, 30))
     remaining = torch.from_numpy(share).float() if blurred_noise else None
-    exposure = Exposure(2.0, Z6.nlf(800), target, remaining_variance=remaining)
     (shot1, read1), (shot2, read2) = (
         [np.array(v)[:, None, None] for v in (n.shot, n.read)] for n in (Z6.nlf(800), target)
     )
     signal = 2.0 * np.maximum(light, 0.0)
     given, wanted = share * (4 * read1 + 2 * shot1 * signal), read2 + shot2 * signal
     beyond = np.maximum(given - wanted, 0.0)
-    excess, lacks = noise_balance(torch.from_numpy(light).float(), exposure)
+    excess, lacks = balance(torch.from_numpy(light).float(), 2.0, Z6.nlf(800), target, remaining)
     assert excess == pytest.approx((beyond / wanted).mean(), rel=1e-4, abs=1e-7)
     assert lacks == bool((wanted > given).any())
 
@@ -175,11 +176,8 @@ def test_the_averaged_table_has_what_a_blur_leaves_in_the_mean() -> None:
     """A quarter and three quarters are a half: the other half of the source's noise is lacking."""
     source, target, share = Z6.nlf(400), Z6.nlf(6400), torch.full((2, 4), 0.25)
     share[0] = 0.75
-    exposures = [
-        Exposure(1.0, source, target),
-        Exposure(1.0, source, target, remaining_variance=share),
-    ]
-    transitions = Transitions.of([torch.zeros(4, 2, 4)] * 2, exposures)
+    table = exposure_table(*[(1.0, source, target)] * 2)
+    transitions = Transitions([torch.zeros(4, 2, 4)] * 2, table, [None, share])
     assert Transitions(transitions.light, transitions.table).averaged_table().shape == (2, 5, 4)
     for table, left in zip(transitions.averaged_table(), (1.0, 0.5), strict=True):
         given, wanted = ([np.array(n.shot), np.array(n.read)] for n in (source, target))
@@ -189,8 +187,8 @@ def test_the_averaged_table_has_what_a_blur_leaves_in_the_mean() -> None:
 
 
 def test_recording_nothing_and_on_other_devices() -> None:
-    assert record(Transitions([], sensor.exposure_table([])), Z6).shape == (0, 2)
-    light, table = torch.empty(4, 2, 3, device="meta"), sensor.exposure_table([STILL])
+    light, table = torch.empty(4, 2, 3, device="meta"), exposure_table((1.0, ZERO, ZERO))
+    assert record(Transitions([], table[:0]), Z6).shape == (0, 2)
     signals, keys = torch.empty(1, 4, 2, 3, device="meta"), np.zeros(1, np.uint64)
     counts = record(Transitions([light], table), Z6, keys=keys, signals=signals)
     assert (tuple(counts.shape), counts.device.type) == ((1, 2), "meta")
@@ -201,10 +199,10 @@ def test_recording_nothing_and_on_other_devices() -> None:
 def test_balance_where_there_is_no_noise() -> None:
     """A clean source lacks all of it; over a target without any, the excess is finite."""
     light = torch.full((4, 4, 4), 0.5)
-    assert noise_balance(light, Exposure(1.0, ZERO, Z6.nlf(100))) == (0.0, True)
-    assert noise_balance(light, STILL) == (0.0, False)
+    assert balance(light, 1.0, ZERO, Z6.nlf(100)) == (0.0, True)
+    assert balance(light, 1.0, ZERO, ZERO) == (0.0, False)
     light[:, 0], shot = 0.0, NoiseLevelFunction((1e-4,) * 4, (0.0,) * 4)  # rows of 0 / 0
-    assert noise_balance(light, Exposure(1.0, shot, ZERO)) == (1e24, False)
+    assert balance(light, 1.0, shot, ZERO) == (1e24, False)
 
 
 # -- the fused kernel -------------------------------------------------------------------------
@@ -214,22 +212,20 @@ def random_light(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed)) * 1.5 - 0.01
 
 
-def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) -> torch.Tensor:
+def reference(light, ratio, source, target, share, normals) -> torch.Tensor:
     """The capture in float64, from the formulas of the noise top-up: numbers before rounding.
 
     Rounding will add 1/12, which is part of the target's noise.
     """
-    x = (light.double() * exposure.ratio).clamp(-1e6, 1e6)
-    source, target = exposure.source_noise, exposure.target
+    x, exposed = (light.double() * ratio).clamp(-1e6, 1e6), source.exposed(ratio)
 
     def variance(nlf: NoiseLevelFunction) -> torch.Tensor:
         shot, read = (torch.tensor(v, dtype=torch.float64) for v in (nlf.shot, nlf.read))
         return read[:, None, None] + shot[:, None, None] * x.clamp(min=0.0)
 
-    share = exposure.remaining_variance
     left = 1.0 if share is None else share.double()
     rounding = 1.0 / (12.0 * torch.tensor(Z6.span, dtype=torch.float64)[:, None, None] ** 2)
-    missing = (variance(target) - left * variance(source) - rounding).clamp(min=0.0)
+    missing = (variance(target) - left * variance(exposed) - rounding).clamp(min=0.0)
     return in_numbers(x + missing.sqrt() * normals.double()).clamp(0.0, Z6.white_level)
 
 
@@ -248,16 +244,13 @@ def test_captures_are_those_of_the_reference(size, noisy_source, blurred, kind):
     light = random_light(4, *size)
     light[:, 0, :3] = torch.tensor([-1e30, 1e30, 3e38])[: size[1]]
     before = light.clone()
-    exposure = Exposure(
-        ratio=0.4,
-        source=Z6.nlf(1600) if noisy_source else ZERO,
-        target=Z6.nlf(400),
-        remaining_variance=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
-    )
+    exposure = 0.4, Z6.nlf(1600) if noisy_source else ZERO, Z6.nlf(400)
+    share = random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None
     keys = noise_keys(5, 3)
     normals = torch.from_numpy(frame_normals(int(keys[0]), (4, *size), kind))
-    exact = reference(light, exposure, normals)
-    transitions, least = Transitions.of([light], [exposure]), {"linear": -(2.0**-10), "images": 0.0}
+    exact = reference(light, *exposure, share, normals)
+    transitions = Transitions([light], exposure_table(exposure), [share])
+    least = {"linear": -(2.0**-10), "images": 0.0}
     frames, *shown = (
         outputs := {n: torch.empty(2, 4, *size) for n in ("signals", *least)}
     ).values()
@@ -287,7 +280,7 @@ def test_every_digital_number_is_written_exactly(body: CameraProfile) -> None:
     kinds = {"codes": np.uint8, "numbers": np.uint16}
     outputs = {name: np.empty((1, 4, len(numbers)), kind) for name, kind in kinds.items()}
     signals = torch.empty(1, 4, len(numbers))
-    table = sensor.exposure_table([STILL])
+    table = exposure_table((1.0, ZERO, ZERO))
     transition = Transitions([light[:, None]], table)
     counts = record(transition, body, **outputs, signals=signals, count=True)
     quantised = clip_and_quantise(light[:, None], body)[:, 0]
@@ -303,8 +296,8 @@ def test_every_digital_number_is_written_exactly(body: CameraProfile) -> None:
 def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind, monkeypatch):
     """Planes of more than 65,536 samples, which are worked on in two pieces."""
     lights = [random_light(4, 250, 265, seed=i) for i in range(3)]
-    exposures = [Exposure(0.6 * (i + 1), ZERO, Z6.nlf(400 * 4**i)) for i in range(3)]
-    keys, transitions = noise_keys(np.arange(3), 2), Transitions.of(lights, exposures)
+    table = exposure_table(*((0.6 * (i + 1), ZERO, Z6.nlf(400 * 4**i)) for i in range(3)))
+    keys, transitions = noise_keys(np.arange(3), 2), Transitions(lights, table)
     functions, which = np.random.default_rng(0).random((2, 2, 4, 256)), np.array([1, 0, 1])
     tables, planes = sensor.packed_tables(*functions), np.arange(4)[:, None, None]
     for threads in (1, 3):
@@ -315,7 +308,7 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind,
         counts = record(transitions, Z6, keys=keys, noise=kind, **outputs)
         for i, light in enumerate(lights):
             alone = torch.empty(1, *light.shape)
-            one = Transitions.of([light], [exposures[i]])
+            one = Transitions([light], table[i : i + 1])
             assert not record(one, Z6, keys=keys[i : i + 1], noise=kind, signals=alone).any()
             assert torch.equal(signals[i], alone[0])
             np.testing.assert_array_equal(codes[i], encode_observation(alone[0]))

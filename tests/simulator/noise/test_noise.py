@@ -19,7 +19,6 @@ from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, get_camera
 from simulator.camera_simulator import CameraSimulator
 from simulator.capture.blurred_frames import Layout
-from simulator.capture.decision import Exposure
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, record, sweep_keys
 from simulator.noise import generator
@@ -34,6 +33,7 @@ from simulator.noise.noise_level_function import (
 from simulator.optics.discs import disc_kernel
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
+from tests.simulator.tables import exposure_table
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))
 ZERO = NoiseLevelFunction.zero()
@@ -193,7 +193,7 @@ def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
     assert torch.equal(*drawn)
     simulated = CameraSimulator().simulate(scenes[0], BASE, seed=3, noise="sensor").data
     assert torch.equal(simulated, scenes[0].expose([BASE], seed=3, noise="sensor")[0])
-    transitions = Transitions.of([light], [scenes[0].exposure(BASE)])
+    ((_, transitions),) = scenes[0].transitions([BASE])
     signals, numbers = torch.empty(1, 4, 9, 70), np.empty((1, 4, 9, 70), np.uint16)
     given = {"keys": np.array([7], np.uint64), "read_noise": ReadNoises.of([ReadNoise(ROW, -0.05)])}
     both = {"signals": signals, "numbers": numbers}
@@ -224,14 +224,14 @@ def test_the_kernel_records_what_its_steps_do(size, bands, noise):
     rng, body, isos = np.random.default_rng(1), get_camera("canon_70d"), [100, 400, 400, 3200, 9999]
     light = torch.from_numpy(rng.uniform(-0.02, 1.2, (5, 4, *size))).float()
     share = torch.from_numpy(rng.random(size)).float()
-    exposures = [Exposure(0.5, body.nlf(iso / 2), body.nlf(iso)) for iso in isos]
-    exposures[2:4] = [replace(known, remaining_variance=share) for known in exposures[2:4]]
-    exposures[4] = replace(exposures[4], source=ZERO)
+    exposures = [(0.5, body.nlf(iso / 2), body.nlf(iso)) for iso in isos]
+    exposures[4] = (0.5, ZERO, body.nlf(isos[4]))
     kinds = ReadNoises.of(list(map(body.read_noise, isos, (1, 1, 4, 2, 2))))
     gains = np.float32(rng.uniform(0.2, 1.8, (5, size[0])))
     gains[1] = 1.0  # it is the same alone, without bands
-    lights, frames = Transitions.of(list(light), exposures), np.empty((3, 5, 4, *size), np.uint16)
-    one = Transitions.of([light[1]], exposures[1:2])
+    table, frames = exposure_table(*exposures), np.empty((3, 5, 4, *size), np.uint16)
+    lights = Transitions(list(light), table, [None, None, share, share, None])
+    one = Transitions([light[1]], table[1:2])
     keys = noise_keys(rng.integers(99, size=5), 3)
     for i, known in enumerate((lights, replace(lights, light=light), one)):
         some = slice(5) if i < 2 else slice(1, 2)
