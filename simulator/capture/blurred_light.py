@@ -258,27 +258,25 @@ class BlurredLight:
             result[i] = light
         return result
 
-    def remaining_energy(self, blur: np.void, layout: Layout | None) -> float:
-        """Share of the source's noise variance that a `BLUR` leaves; 1 where a `layout` differs."""
-        if layout is not None:
-            return 1.0
-        return float(remaining_energy(blur, tuple(self.light.shape[-2:]), blur_tables()))
-
     def remaining_variance(
         self,
         blur: np.void,
         layout: Layout | None,
-        opened_to: float | None,
         vignetting: np.ndarray | None,
-        energy: float,
+        opened_to: float | None,
     ) -> Tensor | None:
-        """`Transitions.remaining_variance` behind a `BLUR`, beyond its `energy`."""
-        left, device = None, self.light.device
-        if layout is not None:
-            moves, numbers = blur["motion_px"] > 0.0, blur[_PATH].item()
-            own = Path(*numbers) if moves and blur["mask"] else None
-            path = Path(*numbers[:3]) if moves else None
-            left = _noise_map(layout, path, own, float(blur["defocus_px"])).to(device)
+        """`Transitions.remaining_variance` behind a `BLUR`; None where the table has all of it.
+
+        The others are of the scene, and of the f-number that its aperture opens to, if it does.
+        """
+        (height, width), device = self.light.shape[-2:], self.light.device
+        moves, numbers = blur["motion_px"] > 0.0, blur[_PATH].item()
+        left, energy, own = None, 1.0, moves and blur["mask"]
+        if layout is not None and (blur["defocus_px"] or own):
+            paths = Path(*numbers[:3]) if moves else None, Path(*numbers) if own else None
+            left = _noise_map(layout, *paths, float(blur["defocus_px"])).to(device)
+        else:
+            energy = float(remaining_energy(blur, (height, width), blur_tables()))
         if opened_to is not None and self.aperture_blur is not None:
             share = self.aperture_blur.remaining_variance(opened_to)
             if share is not None:

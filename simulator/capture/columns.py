@@ -80,7 +80,7 @@ _NETWORK, _CLIPPED, _DEPTH, _ISO, _ROUNDING = range(4, 9)
 MISSED_BLUR, KEPT_BLUR_ERROR = 0.7, 3.0
 #: Second moment of a streak over that of a disc of the same extent, per axis: (1/12) / (1/16).
 STREAK_TO_DISC = 4.0 / 3.0
-#: In place of an address of `Transitions.remaining_variance`: that of `remaining_map`.
+#: In place of an address of `Transitions.remaining_variance`: of a map that is to be made.
 TO_BE_MADE = 1
 #: In place of modules: what `add_networks` has to add before a capture can be planned, the
 #: residuals, or from the next lower number on what each of the networks has denoised.
@@ -486,15 +486,6 @@ def plan_captures(
     origins = [(networks[network], number if opened else None) for network, opened, number in each]
     left: list[torch.Tensor | None] = [None] * count
     for i in np.flatnonzero(made[4]).tolist():
-        left[i] = remaining_map(scene, blurs[i], numbers[i], origins[i][1] is not None)
+        fixed = scene.layout, scene.vignetting(numbers[i]), origins[i][1]
+        left[i] = scene.blurred_light.remaining_variance(blurs[i], *fixed)
     return Planned(origins, blurs, table, left, details)
-
-
-def remaining_map(
-    scene: PreparedScene, blur: np.void, f_number: float, opens: bool
-) -> torch.Tensor | None:
-    """`Transitions.remaining_variance` at an `f_number` behind a `BLUR`; the aperture may open."""
-    light, moves = scene.blurred_light, blur["motion_px"] > 0.0 and blur["mask"]
-    layout = scene.layout if blur["defocus_px"] or moves else None
-    opened_to, energy = f_number if opens else None, light.remaining_energy(blur, layout)
-    return light.remaining_variance(blur, layout, opened_to, scene.vignetting(f_number), energy)
