@@ -367,6 +367,7 @@ class CaptureBatch:
                 columns.add_networks(self._noises[index], scene, lacking)
         elif self._noises is not None:
             self._noises[index] = np.zeros((), columns.NOISE)
+        self._place[index] = self._frames.places(self._light[index])
         self._known[index] = True
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
@@ -436,10 +437,7 @@ class CaptureBatch:
 
     def _make_light(self, indices: np.ndarray, rows: np.ndarray) -> None:
         """Finds the places of the light of `rows`, and makes what is not there."""
-        shown, source = shown_at_rest(indices, self._rest), np.zeros(len(rows), np.uintp)
-        for kind in range(1 if self._noises is None else 2):
-            lights = [self._light[i][kind] for i in shown.tolist()]
-            self._place[shown, kind] = self._frames.places(lights)
+        source = np.zeros(len(rows), np.uintp)
         if len(opened := np.flatnonzero(self._modules[rows] & _OPENING)):
             source[opened] = self._frames.places(self._open(rows[opened]))
         given = self._modules, self._rest, self._place
@@ -541,18 +539,6 @@ def deal_out(passes, scenes, num_scenes, order, ends):  # type: ignore[no-untype
     for unit in range(len(order)):
         order[begin[owner[unit]]] = unit
         begin[owner[unit]] += 1
-
-
-@kernel()
-def shown_at_rest(indices, rest):  # type: ignore[no-untyped-def]
-    """The different scenes that those of `indices` show."""
-    seen, found, count = np.zeros(len(rest), np.bool_), np.empty(len(indices), np.int64), 0
-    for index in indices:
-        scene = rest[index]
-        if not seen[scene]:
-            found[count], seen[scene] = scene, True
-            count += 1
-    return found[:count]
 
 
 @kernel()
