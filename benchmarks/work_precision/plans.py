@@ -234,9 +234,10 @@ def _prepared(
 def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Tensor, Tensor]:
     """Light (4, H, W) of a planned capture, and the variance that is added to it."""
     ((_, found),) = prepared.transitions([settings])
-    ratio, table, (share,) = found.table[0, 0, 0].item(), found.table[0, 1:], found.shares()
     # What is white is white, however bright: its neighbours' noise is pooled with it.
-    light = (found.light[0] * ratio).clamp_(max=1.0)
+    light = (found.light[0] * found.table[0, 0, 0].item()).clamp_(max=1.0)
+    table = torch.from_numpy(found.table[0, 1:, :, None, None])
+    (share,) = found.remaining_variance or [None]
     return light, missing_variance(light, table, share).clamp(min=0.0)
 
 

@@ -286,7 +286,7 @@ class BlurredLight:
                 left = opened if left is None else torch.minimum(left, opened)
         if vignetting is not None:
             # The variance goes with the square of the share r, its top-up with r: exact for shot
-            # noise, and off by r (1 - r) of the source's read noise (`Transitions.in_bands`).
+            # noise, and off by r (1 - r) of the source's read noise (`simulator.capture.sensor`).
             share = torch.from_numpy(vignetting).to(device)
             left = share if left is None else left * share
         return None if left is None else left.float().contiguous()

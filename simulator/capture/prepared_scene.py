@@ -215,8 +215,9 @@ class PreparedScene:
         if self.nlf.is_zero:
             return frame, 0.0
         known = self._transition(settings)
+        shares = known.remaining_variance or [None]
         targets = noise_columns(self.camera, [settings], self.box_factor)
-        excess, _ = noise_balances([known.light[0]], known.shares(), known.table, targets)
+        excess, _ = noise_balances([known.light[0]], shares, known.table, targets)
         return frame, excess.item()
 
     def expose(

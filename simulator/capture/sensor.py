@@ -15,6 +15,12 @@ negative the source is noisier than the target: nothing is added, and -D is the 
 A blur averages the source's noise: where it leaves only a share r of the variance, the other share
 ``(1 - r) (a shot1 max(x, 0) + a^2 read1)`` is missing, too.
 
+*Bands* of flickering light: rows have light of their own, which multiplies the blurred light before
+there is noise. That is exact for motion along the rows; other motion blurs across rows that do not
+share their light. The source's own noise is multiplied with its light, its variance by the square
+of the row's gain, r^2. What the top-up takes away for it has the variance times r: exact for shot
+noise, and off by r (1 - r) of the source's read noise.
+
 *The noise of a frame* is a function of its key and of nothing else (`simulator.noise.generator`).
 
 `record` is the one way from light to frames. On the CPU it is one fused kernel, which works in
@@ -122,30 +128,6 @@ class Transitions:
     #: frame has any.
     remaining_variance: Sequence[torch.Tensor | None] | None = None
 
-    def in_bands(self, row_gain: np.ndarray) -> Transitions:
-        """The same where rows have light of their own: the bands of flickering light.
-
-        `row_gain` (B, H), light of each row relative to the frame's, multiplies the blurred light
-        before there is noise: exact for motion along the rows; other motion blurs across rows that
-        do not share their light. The source's own noise is multiplied with its light, its variance
-        by the square of the row's gain, r^2. What the top-up takes away for it has the variance
-        times r: exact for shot noise, and off by r (1 - r) of the source's read noise.
-        """
-        shares, (_, height, width) = self.shares(), self.shape
-        gains = torch.from_numpy(row_gain).to(self.light[0]).view(-1, height, 1)
-        bands = (row_gain != 1.0).any(axis=1)
-        lights: Lights
-        if isinstance(self.light, torch.Tensor):
-            lights = self.light * gains[:, None]
-        else:
-            each = zip(self.light, gains, bands.tolist(), strict=True)
-            lights = [(light * gain).contiguous() if own else light for light, gain, own in each]
-        noisy = self.table[:, 3:].max(axis=(1, 2)) > 0.0  # the source is
-        for i in np.flatnonzero(bands & noisy).tolist():
-            share, known = gains[i].expand(-1, width), shares[i]
-            shares[i] = (share if known is None else share * known.to(share.device)).contiguous()
-        return Transitions(lights, self.table, shares)
-
     def seen_by(self, responses: Sequence[torch.Tensor | None]) -> Transitions:
         """The same on sensors of these gains, (4, H, W) each; None for gains of 1."""
         if all(gains is None for gains in responses):
@@ -171,16 +153,12 @@ class Transitions:
         """`table` in which each source's noise is what its blur leaves in the mean."""
         if self.remaining_variance is None:
             return self.table
-        left = [1.0 if share is None else float(share.mean()) for share in self.shares()]
+        shares = self.remaining_variance
+        left = [1.0 if share is None else float(share.mean()) for share in shares]
         remaining, table = np.array(left, np.float32)[:, None, None], self.table.copy()
         table[:, 1:3] += (1.0 - remaining) * table[:, 3:]
         table[:, 3:] *= remaining
         return table
-
-    def shares(self) -> list[torch.Tensor | None]:
-        """`remaining_variance` as a list, one entry for each frame."""
-        known = self.remaining_variance
-        return [None] * len(self.light) if known is None else list(known)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -200,30 +178,21 @@ class Transitions:
         """Whether any signal could have less noise than its target; else none need be drawn."""
         if (self.table[:, 1:3] > 0.0).any():
             return True
-        return any(share is not None for share in self.shares())
+        return any(share is not None for share in self.remaining_variance or ())
 
 
 def missing_variance(
-    signal: torch.Tensor,
-    table: np.ndarray | Sequence[torch.Tensor],
-    remaining_variance: torch.Tensor | None = None,
+    signal: torch.Tensor, table: torch.Tensor, remaining_variance: torch.Tensor | None = None
 ) -> torch.Tensor:
     """D(x) of each pixel; negative where the source is noisier.
 
     Args:
-        signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
-        table: (4, 4), rows 1 to 4 of a `Transitions.table`, or (4,), its column for that plane; or
-            four tensors for rows.
-        remaining_variance: (H, W) share of the source's variance that a blur left; None for all.
+        signal: (..., 4, H, W) on the target's scale.
+        table: (..., 4, 4, 1, 1), rows 1 to 4 of a `Transitions.table`.
+        remaining_variance: (H, W) share of the source's variance that a blur left, or
+            (..., 1, H, W); None for all.
     """
-    shot, read, source_shot, source_read = (
-        row
-        if torch.is_tensor(row)
-        else plane_tensor(row, signal.device)
-        if row.ndim
-        else row.item()
-        for row in table
-    )
+    shot, read, source_shot, source_read = table.unbind(-4)
     bright = signal.float().clamp(min=0.0)
     missing = (bright * shot).add_(read)
     if remaining_variance is not None:
@@ -252,7 +221,7 @@ def record(
         keys: (B,) uint64 of the noise; None for none.
         noise: How the keys become noise.
         read_noise: Rows and tails of each frame's read noise, for the noise ``"sensor"``.
-        row_gain: See `Transitions.in_bands`; None where all rows have the frame's light.
+        row_gain: (B, H) light of each row relative to the frame's; None where all rows have that.
         count: Whether clipped samples are counted.
         means: Of the output ``codes``, an array, to fill; None where torch records.
         run: Calls `record_units` for all frames, of which each has so many units, with these
@@ -269,46 +238,49 @@ def record(
         raise ValueError(f"`outputs` (={sorted(unknown)}) must be of {', '.join(_KINDS)}")
     if len(transitions.light) == 0:
         return np.zeros((0, 2), np.int64)
-    if transitions.needs_torch:
-        transitions = transitions if row_gain is None else transitions.in_bands(row_gain)
-        transitions = transitions.before_rounding(camera)
-        tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
-        return record_stepwise(transitions, camera, keys, noise, tensors, read_noise, count=count)
-    arrays = {name: np.asarray(out) for name, out in outputs.items()}
     noises = keys, noise, read_noise
+    if transitions.needs_torch:
+        tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
+        return _record_stepwise(transitions, camera, noises, row_gain, tensors, count)
+    arrays = {name: np.asarray(out) for name, out in outputs.items()}
     return _record_fused(transitions, camera, noises, row_gain, arrays, count, means, run)
 
 
 # -- the steps one by one ---------------------------------------------------------------------
 
 
-def record_stepwise(
+def _record_stepwise(
     transitions: Transitions,
     camera: CameraProfile,
-    keys: np.ndarray | None,
-    noise: Noise,
+    noises: tuple[np.ndarray | None, Noise, ReadNoises | None],
+    row_gain: np.ndarray | None,
     outputs: Mapping[str, torch.Tensor],
-    read_noise: ReadNoises | None = None,
-    *,
-    count: bool = False,
+    count: bool,
 ) -> torch.Tensor:
     """`record` on any device by torch operations: the reference of the fused kernel.
 
-    The `transitions` are `before_rounding`. Frames in one tensor go together, others singly.
+    The `noises` are keys, how they become noise, and the read noise. Frames in one tensor go
+    together, others singly.
     """
+    (keys, noise, read_noise), transitions = noises, transitions.before_rounding(camera)
     lights, device = transitions.light, transitions.light[0].device
     span, black, low, high = (plane_tensor(row, device) for row in camera.digits[:4])
     counts = torch.zeros(len(lights), 2, dtype=torch.int64, device=device)
     together = len(lights) if isinstance(lights, torch.Tensor) else 1
-    shares = transitions.shares()
+    shares = [*(transitions.remaining_variance or ())]
     for first in range(0, len(lights), together):
         part = slice(first, first + together)
         light = lights[part] if isinstance(lights, torch.Tensor) else lights[first][None]
         table = torch.from_numpy(transitions.table[part]).to(device)[..., None, None]
+        share = None if keys is None else _stacked(shares[part], light)
+        if row_gain is not None:
+            gains = torch.from_numpy(row_gain[part]).to(light)[:, None, :, None]
+            light = light * gains
+            if transitions.table[part, 3:].any():  # the source has noise of its own
+                share = gains if share is None else share * gains
         signal = (light * table[:, 0]).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
         if keys is not None:
-            share = _stacked(shares[part], signal)
-            missing = missing_variance(signal, table[:, 1:].unbind(1), share).clamp_(min=0.0)
+            missing = missing_variance(signal, table[:, 1:], share).clamp_(min=0.0)
             if read_noise is not None:
                 some = keys[part], read_noise.part(part)
                 signal = signal + _read_part(missing, table[:, 1:], share, *some)
@@ -351,7 +323,7 @@ def _read_part(
 
     A source's read noise counts as having rows and tails of the same kind.
     """
-    dark = missing_variance(torch.zeros_like(table[:, 0]), table.unbind(1), remaining_variance)
+    dark = missing_variance(torch.zeros_like(table[:, 0]), table, remaining_variance)
     read = torch.minimum(dark.clamp(min=0.0), missing)
     missing -= read
     shape, device = tuple(missing.shape[1:]), missing.device
@@ -595,7 +567,7 @@ def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-de
 
 @_jit()
 def _in_bands(start, light, width, gain, out):  # type: ignore[no-untyped-def]
-    """`Transitions.in_bands` of a piece of a plane of rows that have so many samples."""
+    """Light of a piece of a plane in bands; rows have so many samples."""
     first, size = 0, len(light)
     while first < size:
         row = (start + first) // width
@@ -711,7 +683,7 @@ def _record_fused(
     means: CodeMeans | None,
     run: Callable[[int, tuple[Any, ...]], None] | None,
 ) -> np.ndarray:
-    """`record` on the CPU; the `noises` are keys, how they become noise, and the read noise."""
+    """`record` on the CPU; see `_record_stepwise` for the `noises`."""
     (keys, noise, read_noise), read = noises, None
     light, remaining = transitions.light, transitions.remaining_variance
     frames, samples = len(light), math.prod(transitions.shape[1:])

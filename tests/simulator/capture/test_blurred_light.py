@@ -325,7 +325,8 @@ def alone(scene, state, gain, key, noise="bank"):
     if key is None:  # the light has no pattern of the sensor
         scene = scene.changed(camera=Z6)
     ((_, found),) = scene.transitions(states, gain=np.array([gain]))
-    fixed = found.shares(), found.table, noise_columns(Z6, states, 1)
+    shares = found.remaining_variance or [None]
+    fixed = shares, found.table, noise_columns(Z6, states, 1)
     excess, _ = noise_balances([found.light[0]], *fixed)
     keys = None if key is None else np.array([key], np.uint64)
     counts = record(found, Z6, keys=keys, noise=noise, signals=frame, count=True)
