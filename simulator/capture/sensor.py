@@ -461,14 +461,13 @@ def _digitise_averaged(  # type: ignore[no-untyped-def]
 
 @_jit()
 def _digitise_with_rows(  # type: ignore[no-untyped-def]
-    size, light, normals, read_part, shares, bound, ratio, noise, sensor, out
+    size, light, normals, rows, tails, parts, shares, bound, ratio, noise, sensor, out
 ):
     """The same with read noise that has `rows` and `tails`: draws whose variance is 1.
 
     Of its variance, rows and the rest have the `parts` (2,) of `tail_tables`.
     """
     (shot, read, source_shot, source_read), (span, black, white) = noise, sensor
-    rows, tails, parts = read_part
     deviation, rest = parts[0] * np.sqrt(read if read > _ZERO else _ZERO), parts[1]
     for j in range(size):
         x = _exposed(light[j], ratio, bound)
@@ -484,47 +483,48 @@ def _digitise_with_rows(  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def _draw_read(read, place, size, held, words, made):  # type: ignore[no-untyped-def]
-    """Rows and tails of a block, and their `parts`; see `_draw_rows` for what is `held`.
+def _draw_tails(read, frame, block, words, out):  # type: ignore[no-untyped-def]
+    """`tukey_lambda` of a block of normals; returns its row of the parts of `tail_tables`.
 
-    `read` is what `record_units` has; there is memory for them, and for normals of rows, in `made`.
+    See `_record_fused` for `read`.
     """
-    row_keys, pixel_keys, width, which, parts, tables = read
-    (frame, plane, start, number, samples), kind = place, which[place[0]]
-    where = start, size, width, plane // 2 * (samples // width)
-    held = _draw_rows(row_keys[frame], where, held, words, made[2], made[0])
-    _draw_tails(pixel_keys[frame], number, tables[kind], words, made[1])
-    return held, (made[0], made[1], parts[kind])
-
-
-@_jit()
-def _draw_tails(key, block, table, words, out):  # type: ignore[no-untyped-def]
-    """`tukey_lambda` of a block of normals, by its row of `tail_tables`."""
-    draw_block(key, block, words, out)
+    _, keys, _, which, parts, tables = read
+    kind = which[frame]
+    table = tables[kind]
+    draw_block(keys[frame], block, words, out)
     for j in range(BLOCK):
         place = abs(out[j]) * np.float32(TAIL_STEPS)
         step = np.int32(place)
         low, high = table[np.uint32(step)], table[np.uint32(step + 1)]
         value = low + (place - np.float32(step)) * (high - low)
         out[j] = value if out[j] > _ZERO else -value
+    return parts[kind]
 
 
 @_jit()
-def _draw_rows(key, place, held, words, normals, out):  # type: ignore[no-untyped-def]
-    """Normals that rows share, of a piece of a plane, behind those of so many rows `before`.
+def _draw_rows(read, frame, plane, block, samples, words, out):  # type: ignore[no-untyped-def]
+    """Draws the normals that rows share, those of the rows of a unit that begins with a `block`.
 
-    `normals` are the block of the key whose number is `held`. Returns that of the last one used.
+    Returns how much further on samples of the plane would be if their first row were that of `out`.
     """
-    (start, size, width, before), first = place, 0
+    keys, width = read[0], read[2]
+    before = plane // 2 * (samples // width)  # rows of the planes R and G1
+    start, end = block * BLOCK, min((block + _UNIT_BLOCKS) * BLOCK, samples)
+    first = (before + start // width) // BLOCK
+    for number in range(first, (before + (end - 1) // width) // BLOCK + 1):
+        draw_block(keys[frame], number, words, out[(number - first) * BLOCK :][:BLOCK])
+    return (before - first * BLOCK) * width
+
+
+@_jit()
+def _by_row(start, width, values, out):  # type: ignore[no-untyped-def]
+    """Fills a piece of a plane with the value of each row, which has so many samples."""
+    first, size = 0, len(out)
     while first < size:
         row = (start + first) // width
-        last, number = min(size, (row + 1) * width - start), before + row
-        if number // BLOCK != held:
-            held = number // BLOCK
-            draw_block(key, held, words, normals)
-        out[first:last] = normals[number % BLOCK]
+        last = min(size, (row + 1) * width - start)
+        out[first:last] = values[row]
         first = last
-    return held
 
 
 @_jit()
@@ -566,24 +566,14 @@ def _as_signals(numbers, black, span, least, out):  # type: ignore[no-untyped-de
 
 
 @_jit()
-def _in_bands(start, light, width, gain, out):  # type: ignore[no-untyped-def]
-    """Light of a piece of a plane in bands; rows have so many samples."""
-    first, size = 0, len(light)
-    while first < size:
-        row = (start + first) // width
-        last = min(size, (row + 1) * width - start)
-        for i in range(first, last):
-            out[i] = light[i] * gain[row]
-        first = last
-
-
-@_jit()
-def _band(start, light, shares, own, gain, width, lit, varied):  # type: ignore[no-untyped-def]
-    """Light of a block in bands, and in `varied` what of the source's variance is left there."""
-    _in_bands(start, light, width, gain, lit)
-    if own:  # the source has noise of its own
-        _in_bands(start, shares, width, gain, varied)
-    return lit[: len(light)]
+def _in_bands(start, samples, gain, light, shares, lit, left):  # type: ignore[no-untyped-def]
+    """Light of a piece of a plane in bands, and what is `left` there of the source's variance."""
+    lit, left = lit[: len(light)], left[: len(light)]
+    _by_row(start, samples // len(gain), gain, left)
+    for j in range(len(left)):
+        lit[j] = light[j] * left[j]
+        left[j] *= shares[j]
+    return lit, left
 
 
 @_jit()
@@ -603,15 +593,18 @@ def record_units(  # type: ignore[no-untyped-def]
     codes, numbers, signals, counts = outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     lit, varied = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    all_left, of_read = np.ones(BLOCK, np.float32), np.empty((3, BLOCK), np.float32)
-    words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
+    rows, tails = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    all_left, clipped = np.ones(BLOCK, np.float32), np.empty(BLOCK, np.int32)
+    words = np.empty((4, BLOCK // 4), np.uint32)
+    if read is not None:
+        of_rows = np.empty((_UNIT_BLOCKS // read[2] + 3) * BLOCK, np.float32)
     blocks = (samples + BLOCK - 1) // BLOCK
     pieces = (blocks + _UNIT_BLOCKS - 1) // _UNIT_BLOCKS
     for unit in range(first, last):
         frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
         ratio, shot, dark, source_shot, source_read = exposure[frame, :, plane]
         span, black, low, high, white, rounding = sensor[:, plane]
-        body, dark, held = (span, black, white), dark - rounding, -1
+        body, dark = (span, black, white), dark - rounding
         # A light beyond it is white; one of an exposure of 0 has no bound.
         bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
@@ -619,14 +612,16 @@ def record_units(  # type: ignore[no-untyped-def]
         frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[attr-defined, call-arg]
         shares = samples if remaining[frame] else 0
         share = numba.carray(as_pointer(remaining[frame]), (shares,))
-        clipped[:], own = 0, source_shot > _ZERO or source_read > _ZERO
-        for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
+        clipped[:], begin = 0, piece * _UNIT_BLOCKS
+        if read is not None:
+            shift = _draw_rows(read, frame, plane, begin, samples, words, of_rows)
+        for block in range(begin, min(begin + _UNIT_BLOCKS, blocks)):
             start, end = block * BLOCK, min((block + 1) * BLOCK, samples)
             size, at, number = end - start, plane * samples + start, plane * blocks + block
             exposed, normals, sign, out = frame_light[at : at + size], made, _ONE, part[:size]
+            left = share[start:end] if shares else all_left[:size]
             if gains is not None:
-                left, width = share[start:end] if shares else all_left, samples // gains.shape[1]
-                exposed = _band(start, exposed, left[:size], own, gains[frame], width, lit, varied)
+                exposed, left = _in_bands(start, samples, gains[frame], exposed, left, lit, varied)
             if drawn is not None:
                 draw_block(keys[frame], number, words, made)
             elif keys.size:
@@ -635,20 +630,17 @@ def record_units(  # type: ignore[no-untyped-def]
                 coming = bank_block(keys[frame], number + 1)[0]
                 for line in range(coming, coming + BLOCK, STRIDE):
                     prefetch(bank, line)
-            banded = gains is not None and own
+            noises = shot, dark, source_shot, source_read
             if not keys.size:
                 _digitise(size, exposed, bound, ratio, body, part)
-            elif read is not None or banded or shares:
-                left = varied if banded else share[start:end] if shares else all_left
-                noises = shot, dark, source_shot, source_read
-                if read is not None:
-                    place = frame, plane, start, number, samples
-                    held, of_frame = _draw_read(read, place, size, held, words, of_read)
-                    made_of = exposed, made, of_frame, left
-                    _digitise_with_rows(size, *made_of, bound, ratio, noises, body, part)
-                else:
-                    made_of = exposed, normals, sign, left
-                    _digitise_averaged(size, *made_of, bound, ratio, noises, body, part)
+            elif read is not None:
+                _by_row(start + shift, read[2], of_rows, rows[:size])
+                parts = _draw_tails(read, frame, number, words, tails)
+                made_of = exposed, made, rows, tails, parts, left
+                _digitise_with_rows(size, *made_of, bound, ratio, noises, body, part)
+            elif gains is not None or shares:
+                made_of = exposed, normals, sign, left
+                _digitise_averaged(size, *made_of, bound, ratio, noises, body, part)
             else:
                 _digitise_noisy(size, exposed, normals, sign, bound, ratio, shot, dark, body, part)
             if codes.size:
