@@ -175,8 +175,7 @@ class EpisodeCore:
         self.grid, self.camera = episodes.grid, episodes.camera
         self.scene_ids = episodes.scene_ids
         states = self.grid.states
-        apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
-        self._settings = encode_settings(apex)
+        self._settings = encode_settings(self.grid.apex)
         # (4, S), see `_STATE_INFO`
         self._state_info = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
         self._at_rest: dict[int, PreparedScene] = {}
@@ -203,14 +202,12 @@ class EpisodeCore:
         self.num_actions = self.task.num_actions
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, self._restorable(None)
+        arguments = self.options, len(self.episodes.begun), self._make_task
+        return _restored, (arguments, self.episodes.columns(), self.task.columns())
 
     def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeCore:
-        return _restored(*self._restorable(self.scenes))
-
-    def _restorable(self, scenes: Sequence[Scene] | None) -> tuple[Any, ...]:
-        arguments = self.options, len(self.episodes.begun), self._make_task, scenes
-        return arguments, self.episodes.columns(), self.task.columns()
+        restored, (arguments, *columns) = self.__reduce__()
+        return restored((*arguments, self.scenes), *columns)
 
     def observation_space(self) -> gym.spaces.Dict:
         """Space of one episode's observation."""
