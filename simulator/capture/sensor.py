@@ -605,8 +605,7 @@ def record_units(  # type: ignore[no-untyped-def]
         ratio, shot, dark, source_shot, source_read = exposure[frame, :, plane]
         span, black, low, high, white, rounding = sensor[:, plane]
         body, dark = (span, black, white), dark - rounding
-        # A light beyond it is white; one of an exposure of 0 has no bound.
-        bound = min(_LIMIT / ratio, _LARGEST)
+        bound = min(_LIMIT / ratio, _LARGEST)  # light beyond it is white; not at an exposure of 0
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
         frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[attr-defined, call-arg]
@@ -630,17 +629,15 @@ def record_units(  # type: ignore[no-untyped-def]
                 coming = bank_block(keys[frame], number + 1)[0]
                 for line in range(coming, coming + BLOCK, STRIDE):
                     prefetch(bank, line)
-            noises = shot, dark, source_shot, source_read
+            given = bound, ratio, (shot, dark, source_shot, source_read), body, part
             if not keys.size:
                 _digitise(size, exposed, bound, ratio, body, part)
             elif read is not None:
                 _by_row(start + shift, read[2], of_rows, rows[:size])
                 parts = _draw_tails(read, frame, number, words, tails)
-                made_of = exposed, made, rows, tails, parts, left
-                _digitise_with_rows(size, *made_of, bound, ratio, noises, body, part)
+                _digitise_with_rows(size, exposed, made, rows, tails, parts, left, *given)
             elif gains is not None or shares:
-                made_of = exposed, normals, sign, left
-                _digitise_averaged(size, *made_of, bound, ratio, noises, body, part)
+                _digitise_averaged(size, exposed, normals, sign, left, *given)
             else:
                 _digitise_noisy(size, exposed, normals, sign, bound, ratio, shot, dark, body, part)
             if codes.size:
