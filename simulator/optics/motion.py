@@ -369,29 +369,17 @@ def _widened(points):  # type: ignore[no-untyped-def]
         step = 0.5 * (points[min(i + 1, count - 1)] - points[max(i - 1, 0)])
         step = 2.0 * step if i in (0, count - 1) else step
         target += points[i] ** 2 + step * step / 12.0
-    # Regula falsi in the version of Illinois, between scales that are too low and too high.
-    low, high, below, above, side = 0.0, 1.5, -target, _moment(points, 1.5) - target, 0
-    scale, excess = high, above
-    while above > 0.0 and high - low > 1e-9 and abs(excess) > 1e-9 * target:
-        scale = (low * above - high * below) / (above - below)
-        excess = _moment(points, scale) - target
-        if excess < 0.0:
-            low, below, above = scale, excess, above * (0.5 if side < 0 else 1.0)
-        else:
-            high, above, below = scale, excess, below * (0.5 if side > 0 else 1.0)
-        side = -1 if excess < 0.0 else 1
+    # Between n and n + 1, the taps of a point p have the moment (2 n + 1) p - n (n + 1). The sum
+    # over all points is convex in the scale, of straight pieces: Newton's method ends on the right.
+    scale, before = 1.0, 0.0
+    while target > 0.0 and abs(scale - before) > 1e-9 * scale:
+        slope, rest = 0.0, target
+        for point in points:
+            whole = np.floor(scale * point)
+            slope += (2.0 * whole + 1.0) * point
+            rest += whole * (whole + 1.0)
+        before, scale = scale, rest / slope
     return scale * points
-
-
-@_jit()
-def _moment(points, scale):  # type: ignore[no-untyped-def]
-    """Sum of squares of the taps of `points` times `scale`, by their shares."""
-    moment = 0.0
-    for point in points:
-        value = scale * point
-        share = value - math.floor(value)
-        moment += value * value + share * (1.0 - share)
-    return moment
 
 
 @_jit()
