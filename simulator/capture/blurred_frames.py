@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 
 from simulator.optics import discs
-from simulator.optics.motion import blur_apart, blur_planes, move_rows, streak_share, taps_of
+from simulator.optics.motion import blur_apart, blur_planes, move_rows, streak, taps_of
 from simulator.utils.checks import check_number, check_type
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
@@ -476,8 +476,8 @@ def move_along_rows(first, last, parts, shape, passes, blurs, levels):  # type: 
     """Light that moves along the rows."""
     for unit in range(first, last):
         rows, image, out = _at(unit, parts, shape, passes)
-        n, share = streak_share(blurs[passes[unit // parts].frame].motion_px)
-        move_rows(rows[0], rows[1], image, n, share, _MOST, out)
+        radius, share = streak(blurs[passes[unit // parts].frame].motion_px, shape[2])
+        move_rows(rows[0], rows[1], image, radius, share, _MOST, out)
 
 
 @_jit()

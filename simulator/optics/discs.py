@@ -26,7 +26,7 @@ from simulator.optics.motion import (
     grid_taps,
     has_kernels,
     path_blur,
-    streak_share,
+    streak,
 )
 from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
@@ -129,19 +129,20 @@ def kernel_energy(motion_px, defocus_px, moments, radii):  # type: ignore[no-unt
     The others are `radius_table`.
     """
     disc = coverage(disc_radius(defocus_px, moments, radii))
-    n, end = streak_share(motion_px)
+    radius, end = streak(motion_px, math.inf)
     energy = 0.0
     for shift in range(len(disc)):  # correlations of both with themselves, along the rows
-        ends = end * end * (2.0 * (shift == 0) + (shift == 2 * n + 2))
-        streak = max(2.0 * n + 1.0 - shift, 0.0) + ends + 2.0 * end * (0 < shift <= 2 * n + 1)
-        if streak == 0.0:
+        whole = 2.0 * radius - 1.0
+        ends = end * end * (2.0 * (shift == 0) + (shift == 2 * radius))
+        streaks = max(whole - shift, 0.0) + ends + 2.0 * end * (0 < shift <= whole)
+        if streaks == 0.0:
             break
         products = 0.0
         for y in range(len(disc)):
             for x in range(len(disc) - shift):
                 products += disc[y, x] * disc[y, x + shift]
-        energy += (2.0 if shift else 1.0) * streak * products
-    return energy / (2.0 * n + 1.0 + 2.0 * end) ** 2
+        energy += (2.0 if shift else 1.0) * streaks * products
+    return energy / (2.0 * radius - 1.0 + 2.0 * end) ** 2
 
 
 # -- uniform discs ----------------------------------------------------------------------------

@@ -122,17 +122,17 @@ def path_length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-u
 
 
 @_jit()
-def streak_share(extent_px):  # type: ignore[no-untyped-def]
-    """Pixels n that a streak covers whole on either side, and its share e of one more.
+def streak(extent_px, width):  # type: ignore[no-untyped-def]
+    """Radius r of a streak on rows of `width` pixels, and the share that its two ends have.
 
-    Both 0 where the extent is too small to blur anything.
+    The streak covers ``2 r - 1`` pixels whole. Where it reaches beyond a whole row, its ends, which
+    show the border, stand for the rest.
     """
     target = extent_px * extent_px / 12.0
-    if target < 1e-12:
-        return 0, 0.0
     n = int((math.sqrt(1.0 + extent_px * extent_px) - 1.0) / 2.0)  # n (n + 1) / 3 is it at e = 0
     end = (target - n * (n + 1) / 3.0) * (2 * n + 1) / (2.0 * ((n + 1) ** 2 - target))
-    return n, max(end, 0.0)
+    radius = max(min(n + 1, width - 1), 1)
+    return radius, max(end, 0.0) + (n + 1 - radius)
 
 
 @functools.lru_cache(maxsize=64)
@@ -145,36 +145,32 @@ def motion_kernel(extent_px: float) -> np.ndarray:
     >>> motion_kernel(2.0).round(3).tolist()
     [0.167, 0.667, 0.167]
     """
-    n, end = streak_share(check_number("extent_px", extent_px, 0.0, sys.float_info.max))
-    if not n and not end:
-        return np.ones(1)
-    weights = np.ones(2 * n + 3)
+    radius, end = streak(check_number("extent_px", extent_px, 0.0, sys.float_info.max), math.inf)
+    weights = np.ones(2 * int(radius) + 1)
     weights[0] = weights[-1] = end
-    return weights / (2 * n + 1 + 2.0 * end)
+    return weights / (2 * radius - 1 + 2.0 * end)
 
 
 def motion_blur(light: Tensor, extent_px: float) -> Tensor:
     """Linear light (..., H, W) as it moves by `extent_px` >= 0 pixels along the rows, uniformly."""
-    n, end = streak_share(check_number("extent_px", extent_px, 0.0, sys.float_info.max))
-    if not n and not end:
+    width = light.shape[-1]
+    radius, share = streak(check_number("extent_px", extent_px, 0.0, sys.float_info.max), width)
+    if not extent_px:
         return light
     if has_kernels(light):
-        most = np.float32(math.inf)
-        return by_rows(light, lambda a, b, rows, to: move_rows(a, b, rows, n, end, most, to))
-    width, radius = light.shape[-1], n + 1
-    covered = 2 * n + 1 + 2.0 * end
-    full, edge = 1.0 / covered, end / covered
-    if radius >= width:  # the whole row and both borders: counted, as padding might not fit
-        column = torch.arange(width, device=light.device)
-        left, right = radius - 1 - column + edge / full, column + radius - width + edge / full
-        rows = light.double()
+        fixed = radius, share, np.float32(math.inf)
+        return by_rows(light, lambda a, b, rows, to: move_rows(a, b, rows, *fixed, to))
+    full = 1.0 / (2 * radius - 1 + 2.0 * share)
+    if radius >= width - 1:  # see `_move_whole_rows`
+        column, rows = torch.arange(width, device=light.device), light.double()
+        left, right = radius - 1 - column + share, column + radius - width + share
         total = rows.sum(-1, keepdim=True) + rows[..., :1] * left + rows[..., -1:] * right
         return (total * full).to(light.dtype)
     padded = F.pad(light.reshape(-1, 1, width), (radius, radius), mode="replicate")
     sums = F.pad(padded.double().cumsum(-1), (1, 0))
     inner = sums[..., 2 * radius : 2 * radius + width] - sums[..., 1 : 1 + width]
     ends = padded[..., :width] + padded[..., 2 * radius :]
-    return (inner * full + ends.double() * edge).to(light.dtype).reshape(light.shape)
+    return ((inner + ends.double() * share) * full).to(light.dtype).reshape(light.shape)
 
 
 def has_kernels(light: Tensor) -> bool:
@@ -223,18 +219,18 @@ def pad_rows(rows, y, top, bottom, radius, limit, padded):  # type: ignore[no-un
 
 
 @_jit()
-def _whole_rows(first, last, rows, radius, edge, full, limit, out):  # type: ignore[no-untyped-def]
-    """A streak that covers a whole row and both borders: their pixels are counted."""
-    width, share = rows.shape[1], edge / full
+def _move_whole_rows(first, last, rows, radius, end, limit, out):  # type: ignore[no-untyped-def]
+    """`move_rows` where the streak covers all of a row: pixels at the borders are counted."""
+    width, full = rows.shape[1], 1.0 / (2 * radius - 1 + 2.0 * end)
     for y in range(first, last):
         total = 0.0
         for x in range(width):
             total += min(max(rows[y, x], -limit), limit)
         begin = min(max(rows[y, 0], -limit), limit)
-        end = min(max(rows[y, width - 1], -limit), limit)
+        behind = min(max(rows[y, width - 1], -limit), limit)
         for x in range(width):
-            left, right = radius - 1 - x + share, x + radius - width + share
-            out[y, x] = np.float32((total + begin * left + end * right) * full)
+            left, right = radius - 1 - x + end, x + radius - width + end
+            out[y, x] = np.float32((total + begin * left + behind * right) * full)
 
 
 @_jit()
@@ -256,8 +252,13 @@ def _box(current, following, length, out):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def _streak(first, last, rows, radius, share, full, limit, out):  # type: ignore[no-untyped-def]
+def move_rows(first, last, rows, radius, end, limit, out):  # type: ignore[no-untyped-def]
+    """Rows `first` to `last` behind a `streak` of this radius and share of its ends."""
     width = rows.shape[1]
+    if radius >= width - 1:
+        _move_whole_rows(first, last, rows, radius, end, limit, out)
+        return
+    full, share = np.float32(1.0 / (2 * radius - 1 + 2.0 * end)), np.float32(end)
     pitch = width + 2 * radius
     many = max(1, _GROUP // pitch)
     padded = np.empty((many, pitch), np.float32)
@@ -273,16 +274,6 @@ def _streak(first, last, rows, radius, share, full, limit, out):  # type: ignore
                 ends = padded[i, x] + padded[i, np.uint64(x + 2 * radius)]
                 # One product to a sum: of two, the compiler would choose which one it fuses.
                 out[row, x] = (box[i, x] + ends * share) * full
-
-
-@_jit()
-def move_rows(first, last, rows, n, end, limit, out):  # type: ignore[no-untyped-def]
-    """Rows `first` to `last` behind a streak of 2 n + 1 pixels and a share of two more."""
-    full = 1.0 / (2 * n + 1 + 2.0 * end)
-    if n + 1 >= rows.shape[1]:
-        _whole_rows(first, last, rows, n + 1, end * full, full, limit, out)
-    else:
-        _streak(first, last, rows, n + 1, np.float32(end), np.float32(full), limit, out)
 
 
 # -- paths: taps and their sums ---------------------------------------------------------------
@@ -310,7 +301,18 @@ def path_taps(path: Path, height: int, width: int) -> Taps:
 def taps_of(extent, direction, turn, drift_x, drift_y, height, width):  # type: ignore[no-untyped-def]
     """Rows, columns and weights of `path_taps`, inside kernels."""
     if turn == 0.0 and drift_y == 0.0 and direction == 0.0:
-        return _streak_taps(abs(extent + drift_x), width)
+        radius, end = streak(abs(extent + drift_x), width)
+        grid, top, left = np.ones((1, 2 * radius + 1)), _TOP, -radius
+        grid[0, 0] = grid[0, 2 * radius] = end
+    else:
+        grid, top, left = _path_grid(extent, direction, turn, drift_x, drift_y, height, width)
+    rows, columns, weights = grid_taps(grid, top, left, _LEAST_WEIGHT)
+    return rows, columns, (weights / weights.sum()).astype(np.float32)
+
+
+@_jit()
+def _path_grid(extent, direction, turn, drift_x, drift_y, height, width):  # type: ignore[no-untyped-def]
+    """Shares of a path in pixels, and the first row and column of the grid; see `grid_taps`."""
     length = path_length(extent, direction, turn, drift_x, drift_y)
     count = math.ceil(min(max(_POINTS_PER_PIXEL * length, 8.0), _MOST_POINTS))
     y, x = _positions(extent, direction, turn, drift_x, drift_y, count)
@@ -326,20 +328,7 @@ def taps_of(extent, direction, turn, drift_x, drift_y, height, width):  # type: 
             for over in range(2):
                 share = x[i] - column if over else 1.0 - (x[i] - column)
                 grid[inside, min(max(column + over, left), right) - left] += part * share
-    rows, columns, weights = grid_taps(grid, top, left, _LEAST_WEIGHT)
-    return rows, columns, (weights / weights.sum()).astype(np.float32)
-
-
-@_jit()
-def _streak_taps(extent_px, width):  # type: ignore[no-untyped-def]
-    """The taps of a streak along the rows, as `motion_kernel` has them."""
-    n, end = streak_share(extent_px)
-    reach = min(n + 1, width - 1)
-    row = np.ones((1, 2 * reach + 1))
-    # The border stands for what lies beyond it, of which the last pixel has a share.
-    row[0, 0] = row[0, 2 * reach] = end + (n + 1 - reach) if reach else 1.0
-    rows, columns, weights = grid_taps(row, _TOP, -reach, -1.0)
-    return rows, columns, (weights / weights.sum()).astype(np.float32)
+    return grid, top, left
 
 
 @_jit()
