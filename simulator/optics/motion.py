@@ -125,30 +125,15 @@ def path_length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-u
 def streak(extent_px, width):  # type: ignore[no-untyped-def]
     """Radius r of a streak on rows of `width` pixels, and the share that its two ends have.
 
-    The streak covers ``2 r - 1`` pixels whole. Where it reaches beyond a whole row, its ends, which
-    show the border, stand for the rest.
+    The streak covers ``2 r - 1`` pixels whole. With n = r - 1 and a share e, its second moment is
+    ``(n (n + 1) (2 n + 1) / 3 + 2 e (n + 1)^2) / (2 n + 1 + 2 e)``, solved for both. Where the
+    streak reaches beyond a whole row, its ends, which show the border, stand for the rest.
     """
     target = extent_px * extent_px / 12.0
     n = int((math.sqrt(1.0 + extent_px * extent_px) - 1.0) / 2.0)  # n (n + 1) / 3 is it at e = 0
     end = (target - n * (n + 1) / 3.0) * (2 * n + 1) / (2.0 * ((n + 1) ** 2 - target))
     radius = max(min(n + 1, width - 1), 1)
     return radius, max(end, 0.0) + (n + 1 - radius)
-
-
-@functools.lru_cache(maxsize=64)
-def motion_kernel(extent_px: float) -> np.ndarray:
-    """Weights (K,), K odd, of a uniform streak of `extent_px` pixels.
-
-    The streak covers ``2 n + 1`` pixels whole and a share e of one more at each end. Its second
-    moment, ``(n (n + 1) (2 n + 1) / 3 + 2 e (n + 1)^2) / (2 n + 1 + 2 e)``, is solved for n and e.
-
-    >>> motion_kernel(2.0).round(3).tolist()
-    [0.167, 0.667, 0.167]
-    """
-    radius, end = streak(check_number("extent_px", extent_px, 0.0, sys.float_info.max), math.inf)
-    weights = np.ones(2 * int(radius) + 1)
-    weights[0] = weights[-1] = end
-    return weights / (2 * radius - 1 + 2.0 * end)
 
 
 def motion_blur(light: Tensor, extent_px: float) -> Tensor:

@@ -23,16 +23,10 @@ from simulator.capture.statistics import DenoisedLight, Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.noise.generator import noise_keys
 from simulator.optics.discs import DIAMETERS, DiscBank, added_blur, disc_blur, disc_kernel
-from simulator.optics.motion import (
-    Movement,
-    Path,
-    motion_blur,
-    motion_kernel,
-    path_blur,
-    path_taps,
-)
+from simulator.optics.motion import Movement, Path, motion_blur, path_blur, path_taps
 from simulator.optics.vignetting import Vignetting
 from simulator.utils.tiles import make_tiles
+from tests.simulator.tables import streak_kernel
 
 Z6 = get_camera("nikon_z6")
 ZERO = NoiseLevelFunction.zero()
@@ -140,7 +134,7 @@ def test_noise_that_opening_and_motion_leave() -> None:
     left = BlurredLight(LIGHT, Z6.nlf(800), opens).remaining_variance
     assert torch.equal(left(blur[0], None, None, 4.0), alone)
     blur["motion_px"], blur["streaks"] = 3.0, True
-    energy = np.square(motion_kernel(3.0)).sum().item()
+    energy = np.square(streak_kernel(3.0)).sum().item()
     moved = (alone / energy).clamp(max=1.0)
     torch.testing.assert_close(left(blur[0], None, None, 4.0), moved, rtol=1e-5, atol=0)
 
@@ -264,7 +258,7 @@ def test_many_images_are_scipys_correlation(threads, most_bytes, monkeypatch):
             rtol, clipped = 2e-4 if i == 0 else 1e-5, lights[i].double().clamp(-1e9, 1e9).numpy()
             weights = disc_kernel(blurs["defocus_px"][i])[None]
             wanted = correlate(clipped, weights, mode="nearest")
-            streak = motion_kernel(blurs["motion_px"][i])[None, None]
+            streak = streak_kernel(blurs["motion_px"][i])[None, None]
             wanted = correlate(wanted, streak, mode="nearest")
             np.testing.assert_allclose(found, wanted, rtol, atol=atol.get(int(i), 0.0))
 

@@ -29,6 +29,7 @@ PATHS = [
     Path(9.0, 1.0, 0.5, drift_x=-6.0, drift_y=4.0),
     Path(0.0, drift_x=3.0, drift_y=-5.0),
 ]
+from tests.simulator.tables import streak_kernel
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -154,7 +155,7 @@ def lamp(*shape: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("extent", EXTENTS)
 def test_second_moments_are_those_of_uniform_motion_and_of_a_uniform_disc(extent):
-    streak, disc = motion.motion_kernel(extent), disc_kernel(extent)
+    streak, disc = streak_kernel(extent), disc_kernel(extent)
     # A disc's to a hundredth of a pixel: a tenth is where a blur begins to matter to any score.
     assert disc.shape == (len(disc),) * 2
     for weights, share, error in ((streak, 12, 1e-6), (disc.sum(0), 16, 0), (disc.sum(1), 16, 0)):
@@ -177,7 +178,7 @@ def test_application_is_scipys_convolution(extent, shape):
     """Direct and Fourier sums of discs, running sums of streaks, streaks longer than the row.
 
     Those in float32 are kernels for the CPU; torch's sums serve other types and devices."""
-    blurs = {motion_blur: motion.motion_kernel(extent)[None]}
+    blurs = {motion_blur: streak_kernel(extent)[None]}
     blurs |= {disc_blur: disc_kernel(extent)} if extent < 100 else {}
     for blur, weights in blurs.items():
         kernel = weights.reshape(*[1] * (len(shape) - 2), *weights.shape)
@@ -195,7 +196,7 @@ def test_application_is_scipys_convolution(extent, shape):
 )
 def test_kernel_energy_is_what_a_blur_leaves_of_white_noise(extent, diameter):
     """Averaging independent pixels multiplies the variance by the sum of squared weights."""
-    disc, streak = disc_kernel(diameter), motion.motion_kernel(extent)
+    disc, streak = disc_kernel(diameter), streak_kernel(extent)
     response = np.stack([np.convolve(row, streak) for row in disc])
     found = discs.kernel_energy(extent, diameter, *discs.radius_table())
     assert found == pytest.approx((response**2).sum(), rel=1e-9)
