@@ -427,15 +427,10 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
     height, width = mask.shape
     rows, columns, weights = own
     # What the subject is smeared over: elsewhere there is nothing of it.
-    top, bottom, left, right = height, 0, width, 0
-    for y in range(height):
-        for x in range(width):
-            if mask[y, x] > 0:
-                top, bottom = min(top, y), max(bottom, y + 1)
-                left, right = min(left, x), max(right, x + 1)
+    own_rows, own_columns = np.nonzero(mask)
     down, over = np.abs(rows).max(), np.abs(columns).max()
-    top, bottom = max(top - down, 0), min(bottom + down, height)
-    left, right = max(left - over, 0), min(right + over, width)
+    top, bottom = max(own_rows.min() - down, 0), min(own_rows.max() + 1 + down, height)
+    left, right = max(own_columns.min() - over, 0), min(own_columns.max() + 1 + over, width)
     back = np.empty((height, width), np.float32)
     apart = np.zeros((height, right - left), np.float32)
     front, cover = np.empty_like(apart), np.empty_like(apart)
@@ -447,14 +442,11 @@ def blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-
         flat = source.reshape(-1)
         copy_row(flat, back.reshape(-1))
         for y in range(top, bottom):
-            own, at = back[y, left:right], behind[y, left:right]
+            shown, marks, at = source[y, left:right], mask[y, left:right], behind[y, left:right]
+            own, only = back[y, left:right], apart[y]
             for x in range(right - left):
                 own[x] = flat[np.uint64(at[x])]
-            shown, marks, only = source[y, left:right], mask[y, left:right], apart[y]
-            for x in range(right - left):
-                value = shown[x]
-                value = value if value < limit else limit
-                only[x] = marks[x] * (value if value > -limit else -limit)
+                only[x] = marks[x] * shown[x]  # which `blur_rows` limits
         blur_rows(_TOP, height, back, taps[0], taps[1], taps[2], limit, result)
         blur_rows(top, bottom, apart, rows, columns, weights, limit, front)
         for y in range(top, bottom):
