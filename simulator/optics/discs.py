@@ -186,8 +186,7 @@ def disc_taps(radius):  # type: ignore[no-untyped-def]
     """Rows, columns and weights of the `Taps` of a disc."""
     disc = coverage(radius)
     reach = len(disc) // 2
-    rows, columns, weights = grid_taps(disc, -reach, -reach, 0.0)
-    return rows, columns, weights.astype(np.float32)
+    return grid_taps(disc, -reach, -reach)
 
 
 # -- a bank of discs --------------------------------------------------------------------------

@@ -291,8 +291,7 @@ def taps_of(extent, direction, turn, drift_x, drift_y, height, width):  # type: 
         grid[0, 0] = grid[0, 2 * radius] = end
     else:
         grid, top, left = _path_grid(extent, direction, turn, drift_x, drift_y, height, width)
-    rows, columns, weights = grid_taps(grid, top, left, _LEAST_WEIGHT)
-    return rows, columns, (weights / weights.sum()).astype(np.float32)
+    return grid_taps(grid, top, left)
 
 
 @_jit()
@@ -357,20 +356,20 @@ def _widened(points):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def grid_taps(grid, top, left, least):  # type: ignore[no-untyped-def]
-    """Rows, columns and float64 weights of `Taps`: the shares in a grid that are above `least`.
+def grid_taps(grid, top, left):  # type: ignore[no-untyped-def]
+    """Rows, columns and weights of `Taps`, by their shares in a grid.
 
     Its first row and column look `top` rows down and `left` columns to the right.
     """
-    size = ((grid > least).sum() + 7) // 8 * 8
+    size = ((grid > _LEAST_WEIGHT).sum() + 7) // 8 * 8
     rows, columns, weights = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size)
     k = 0
     for i in range(len(grid)):
         for j in range(grid.shape[1]):
-            if grid[i, j] > least:
+            if grid[i, j] > _LEAST_WEIGHT:
                 rows[k], columns[k], weights[k] = i + top, j + left, grid[i, j]
                 k += 1
-    return rows, columns, weights
+    return rows, columns, (weights / weights.sum()).astype(np.float32)
 
 
 @_jit()
