@@ -15,7 +15,7 @@ import reprlib
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,8 +83,8 @@ def _find(values, limits, indices):  # type: ignore[no-untyped-def]
 def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyped-def]
     """Adds each pixel of some rows of light (P, H, W) to the bin of its light, by `edges` (P, B-1).
 
-    `bins` (P, B, 6), where what is known of a bin lies together: number, light of at least 0,
-    squares of the Laplacian, of the second difference along the row; least and most light, >= 0.
+    `bins` (P, B, 6), where what is known of a bin lies together: number, least and most light of at
+    least 0, sum of that, and of squares of the Laplacian, and of second differences along the row.
     """
     _, height, width = light.shape
     indices = np.empty(width, np.uint32)
@@ -103,11 +103,11 @@ def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyp
                 across = np.float64(above[x]) + np.float64(below[x]) - twice
                 level = max(np.float64(value), 0.0)
                 found[0] += 1.0
-                found[1] += level
-                found[2] += (along + across) ** 2
-                found[3] += along * along
-                found[4] = min(found[4], level)
-                found[5] = max(found[5], level)
+                found[1] = min(found[1], level)
+                found[2] = max(found[2], level)
+                found[3] += level
+                found[4] += (along + across) ** 2
+                found[5] += along * along
 
 
 @kernel(fastmath=SUMS, boundscheck=False)
@@ -213,16 +213,6 @@ def hidden_highlights(ratio, target, share, estimate):  # type: ignore[no-untype
 # -- the statistics ---------------------------------------------------------------------------
 
 
-class _Bins(NamedTuple):
-    """Pixels of each plane in bins of similar light, (4, B) float64 each."""
-
-    share: np.ndarray  # of all pixels
-    light: np.ndarray  # mean, at least 0
-    edges: np.ndarray  # (2, 4, B) least and most light, at least 0
-    disc: np.ndarray  # mean square of the Laplacian
-    row: np.ndarray  # mean square of the second difference along the rows
-
-
 class LightStatistics:
     """Noise and curvature of a light, by its levels; each value is computed when first needed.
 
@@ -242,7 +232,7 @@ class LightStatistics:
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
         noises = noise_numbers(source), noise_numbers(target)
-        return float(excess_error(bins.share, bins.edges, float(ratio), *noises))
+        return float(excess_error(bins[0], bins[1:3], float(ratio), *noises))
 
     def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
@@ -257,15 +247,13 @@ class LightStatistics:
     @functools.cached_property
     def columns(self) -> np.ndarray:
         """(4, P, B): share, light, and squared second differences of bins, for `curvature`."""
-        bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
-        return np.stack([bins.share, bins.edges[0], bins.disc, bins.row])
+        return self._bins[[0, 1, 4, 5]]
 
     @property
     def noise_columns(self) -> np.ndarray:
         """(4, P, B): share, least, most and mean light of bins, for errors of a source's noise."""
-        bins = self._bins
-        return np.stack([bins.share, *bins.edges, bins.light])
+        return self._bins[:4]
 
     def blur_change(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction, *, noise: bool
@@ -276,13 +264,12 @@ class LightStatistics:
         With `noise` a capture is wanted, in which what is surely white shows no change.
         """
         bins, noises = self._bins, (noise_numbers(source), noise_numbers(target))
-        light = bins.share, bins.light, bins.disc
-        return float(blur_change(*light, float(ratio), *noises, noise))
+        return float(blur_change(bins[0], bins[3], bins[4], float(ratio), *noises, noise))
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""
         bins = self._bins
-        return float(relative_level(bins.share, bins.light, float(ratio), noise_numbers(target)))
+        return float(relative_level(bins[0], bins[3], float(ratio), noise_numbers(target)))
 
     def relative_noise(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
@@ -290,10 +277,11 @@ class LightStatistics:
         """Root mean square of the exposed source's noise in units of the target's."""
         bins, exposed = self._bins, source.exposed(ratio)
         noises = noise_numbers(exposed), noise_numbers(target)
-        return math.sqrt(variance_beyond(bins.share, bins.light, float(ratio), *noises, 0.0))
+        return math.sqrt(variance_beyond(bins[0], bins[3], float(ratio), *noises, 0.0))
 
     @functools.cached_property
-    def _bins(self) -> _Bins:
+    def _bins(self) -> np.ndarray:
+        """(6, P, B): share, least, most and mean light, and squared second differences of bins."""
         light, (height, width) = self.light.cpu().numpy(), self.light.shape[-2:]
         # Whole rows: every column counts alike whatever the width, and a row is read at once.
         step = math.ceil(height * width / SAMPLES)
@@ -305,14 +293,15 @@ class LightStatistics:
         ordered = np.sort(light[:, rows].reshape(4, -1)[:, ::step], axis=1)
         limits = ordered[:, np.arange(1, BINS) * ordered.shape[1] // BINS]
         bins = np.zeros((4, BINS, 6))
-        bins[..., 4] = np.inf
+        bins[..., 1] = np.inf
         least = 1 + _WORTH_A_THREAD // samples
         fixed = (light, rows, np.ascontiguousarray(limits), bins)
         parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
         found = np.ascontiguousarray(np.moveaxis(bins, 2, 0))
-        light, disc, row = found[1:4] / np.maximum(found[0], 1.0)  # equal light leaves bins empty
-        edges = np.where(found[0] > 0, found[4:], 0.0)
-        return _Bins(found[0] / (4.0 * samples), light, edges, disc, row)
+        found[1, found[0] == 0.0] = 0.0  # equal light leaves bins empty
+        found[3:] /= np.maximum(found[0], 1.0)
+        found[0] /= 4.0 * samples
+        return found
 
 
 @functools.lru_cache(maxsize=256)
