@@ -488,12 +488,11 @@ def move_along_paths(first, last, parts, shape, passes, blurs, levels):  # type:
         rows, image, out = _at(unit, parts, shape, passes)
         blur = blurs[passes[unit // parts].frame]
         path = blur.extent, blur.direction, blur.turn
-        taps = taps_of(path[0], path[1], path[2], still, still, height, width)
+        taps = taps_of(*path, still, still, height, width)
         if not blur.mask:
             blur_planes(rows[0], rows[1], image, height, taps, _MOST, out)
         elif rows[0] % height == 0:  # whoever has the first rows of a plane does all of it
-            drift = blur.drift_x, blur.drift_y
-            own = taps_of(path[0], path[1], path[2], drift[0], drift[1], height, width)
+            own = taps_of(*path, blur.drift_x, blur.drift_y, height, width)
             mask = _array_at(blur.mask, (height, width))
             behind = _array_at(blur.behind, (height, width)).view(np.int32)
             begin, end = rows[0], (rows[1] + height - 1) // height * height

@@ -151,16 +151,16 @@ def kernel_energy(motion_px, defocus_px, moments, radii):  # type: ignore[no-unt
 def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     """Defocus of linear `light` (..., H, W) by a uniform disc of `diameter_px` >= 0 pixels."""
     weights = disc_kernel(diameter_px)
-    taps = weights.shape[0]
-    if taps == 1:
+    taps, reach = len(weights), len(weights) // 2
+    if not reach:
         return light
     if taps <= _DIRECT_TAPS and has_kernels(light):
-        return path_blur(light, Taps(*disc_taps(disc_radius(diameter_px, *radius_table()))))
+        return path_blur(light, Taps(*grid_taps(weights, -reach, -reach)))
     disc = torch.from_numpy(weights).to(light.device)
     # float64: a GPU rounds convolutions in float32 to TF32, and in a Fourier transform a lamp a
     # thousand times above white must not leave ringing in the shadows.
     planes = light.reshape(-1, 1, *light.shape[-2:])
-    padded = F.pad(planes, (taps // 2,) * 4, mode="replicate").double()
+    padded = F.pad(planes, (reach,) * 4, mode="replicate").double()
     if taps <= _FFT_TAPS:
         blurred = F.conv2d(padded, disc[None, None])
     else:
@@ -247,11 +247,9 @@ class DiscBank:
 
 def _weights(squared: Tensor) -> Iterator[tuple[int, Tensor]]:
     """(index, weight) of every disc that some pixel needs: hat functions of squared diameter."""
-    knots = np.square(DIAMETERS).tolist()
+    knots = [-1.0, *np.square(DIAMETERS).tolist(), DIAMETERS[-1] ** 2 + 1.0]
     low, high = (float(v) for v in torch.aminmax(squared.detach()))
-    for index, knot in enumerate(knots):
-        before = knots[index - 1] if index else -1.0
-        after = knots[index + 1] if index + 1 < len(knots) else knot + 1.0
+    for index, (before, knot, after) in enumerate(zip(knots, knots[1:], knots[2:], strict=False)):
         if before < high and low < after:
             rising = (squared - before) / (knot - before)
             falling = (after - squared) / (after - knot)
