@@ -432,82 +432,75 @@ def _add_disc(  # type: ignore[no-untyped-def]
 # of all planes (P, H, W) of a frame. There is one for each kind of pass: what compiles slowly and
 # is not needed is not compiled.
 @_jit()
-def _share(unit, parts, rows):  # type: ignore[no-untyped-def]
-    """The first row of a unit, and the first behind it."""
-    return unit % parts * rows // parts, (unit % parts + 1) * rows // parts
-
-
-@_jit()
 def _at(unit, parts, shape, passes):  # type: ignore[no-untyped-def]
-    """Rows of a unit, and what it reads and writes, (P H, W)."""
-    planes, height, width = shape
-    one, rows = passes[unit // parts], _share(unit, parts, planes * height)
-    shape = planes * height, width
-    return rows, _array_at(one.source, shape), _array_at(one.to, shape)
+    """First row of a unit, the first behind it, and what it reads and writes, (P H, W)."""
+    one, rows, width = passes[unit // parts], shape[0] * shape[1], shape[2]
+    first, last = unit % parts * rows // parts, (unit % parts + 1) * rows // parts
+    return first, last, _array_at(one.source, (rows, width)), _array_at(one.to, (rows, width))
 
 
 @_jit()
 def blur_discs(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light behind one disc each."""
     for unit in range(first, last):
-        rows, image, out = _at(unit, parts, shape, passes)
-        taps = discs.disc_taps(passes[unit // parts].radius)
-        blur_planes(rows[0], rows[1], image, shape[1], taps, _MOST, out)
+        one = passes[unit // parts]
+        top, bottom, light, out = _at(unit, parts, shape, passes)
+        blur_planes(top, bottom, light, shape[1], discs.disc_taps(one.radius), _MOST, out)
 
 
 @_jit()
 def blend_discs(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light behind a disc of its own for each pixel, from `levels` (K, 13)."""
     planes, height, width = shape
-    samples, count = planes * height * width, max(planes // parts, 1)
+    count = max(planes // parts, 1)
     for unit in range(first, last):
-        one, rows = passes[unit // parts], _share(unit, parts, planes * height)
-        blur = blurs[one.frame]
-        diameter = _array_at(blur.diameter, (height, width))
-        scale = np.float32(blur.defocus_px)
-        top, plane = rows[0] % height, rows[0] // height
-        out = _array_at(one.to, (planes, height, width))[plane : plane + count]
-        bottom, begin, own = top + (rows[1] - rows[0]) // count, plane * height * width, one.frame
-        discs.blend_rows(top, bottom, diameter, scale, _KNOTS, levels[own], begin, samples, out)
+        one = passes[unit // parts]
+        begin, end, light, out = _at(unit, parts, shape, passes)
+        blur, own, plane = blurs[one.frame], levels[one.frame], begin // height
+        diameter, scale = _array_at(blur.diameter, (height, width)), np.float32(blur.defocus_px)
+        top, bottom = begin % height, begin % height + (end - begin) // count
+        result, skipped = out.reshape(shape)[plane : plane + count], plane * height * width
+        discs.blend_rows(top, bottom, diameter, scale, _KNOTS, own, skipped, light.size, result)
 
 
 @_jit()
 def move_along_rows(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light that moves along the rows."""
     for unit in range(first, last):
-        rows, image, out = _at(unit, parts, shape, passes)
-        radius, share = streak(blurs[passes[unit // parts].frame].motion_px, shape[2])
-        move_rows(rows[0], rows[1], image, radius, share, _MOST, out)
+        one = passes[unit // parts]
+        top, bottom, light, out = _at(unit, parts, shape, passes)
+        radius, share = streak(blurs[one.frame].motion_px, shape[2])
+        move_rows(top, bottom, light, radius, share, _MOST, out)
 
 
 @_jit()
 def move_along_paths(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light that moves along a path, and a subject that moves along its own."""
-    still, (_, height, width) = 0.0, shape
+    still, size, height = 0.0, shape[1:], shape[1]
     for unit in range(first, last):
-        rows, image, out = _at(unit, parts, shape, passes)
         blur = blurs[passes[unit // parts].frame]
+        top, bottom, light, out = _at(unit, parts, shape, passes)
         path = blur.extent, blur.direction, blur.turn
-        taps = taps_of(*path, still, still, height, width)
+        taps = taps_of(*path, still, still, *size)
         if not blur.mask:
-            blur_planes(rows[0], rows[1], image, height, taps, _MOST, out)
-        elif rows[0] % height == 0:  # whoever has the first rows of a plane does all of it
-            own = taps_of(*path, blur.drift_x, blur.drift_y, height, width)
-            mask = _array_at(blur.mask, (height, width))
-            behind = _array_at(blur.behind, (height, width)).view(np.int32)
-            begin, end = rows[0], (rows[1] + height - 1) // height * height
-            blur_apart(image[begin:end], mask, behind, taps, own, _MOST, out[begin:end])
+            blur_planes(top, bottom, light, height, taps, _MOST, out)
+        elif top % height == 0:  # whoever has the first rows of a plane does all of it
+            own = taps_of(*path, blur.drift_x, blur.drift_y, *size)
+            mask, behind = _array_at(blur.mask, size), _array_at(blur.behind, size).view(np.int32)
+            bottom = (bottom + height - 1) // height * height
+            blur_apart(light[top:bottom], mask, behind, taps, own, _MOST, out[top:bottom])
 
 
 @_jit()
 def darken(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no-untyped-def]
     """Light through a lens with vignetting; a frame may be darkened in place."""
     for unit in range(first, last):
-        rows, image, out = _at(unit, parts, shape, passes)
-        left = _array_at(blurs[passes[unit // parts].frame].vignetting, shape[1:])
-        for y in range(rows[0], rows[1]):
+        one = passes[unit // parts]
+        top, bottom, light, out = _at(unit, parts, shape, passes)
+        left = _array_at(blurs[one.frame].vignetting, shape[1:])
+        for y in range(top, bottom):
             for x in range(shape[2]):
-                out[y, x] = image[y, x] * left[y % shape[1], x]
+                out[y, x] = light[y, x] * left[y % shape[1], x]
 
 
 _TASKS: Any = None, blur_discs, blend_discs, move_along_rows, move_along_paths, darken
