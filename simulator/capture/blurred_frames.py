@@ -208,10 +208,9 @@ class BlurredFrames:
         # Places that each scene holds: behind the lens at each aperture, behind each disc, in
         # motion, and of its layout where that is a frame, too.
         self._held = np.zeros((num_scenes, num_apertures + len(discs.DIAMETERS) + 2), np.uintp)
-        # The light, and the diameter of the disc, that they were made of.
-        shape = num_scenes, num_apertures
-        self._source, self._diameter = np.zeros(shape, np.uintp), np.zeros(shape)
-        self._levels_source = np.zeros(num_scenes, np.uintp)
+        # The light that each was made of, and at each aperture the diameter of the disc.
+        self._source = np.zeros_like(self._held)
+        self._diameter = np.zeros((num_scenes, num_apertures))
         self._slabs = list[torch.Tensor]()
         # Places, of which the first are free, and how many: an array, which kernels change at once
         # with what is held, whatever interrupts their caller.
@@ -289,7 +288,7 @@ class BlurredFrames:
         count, done, planned, lacking = len(indices), 0, 0, 0
         light, levels = np.empty(count, np.uintp), np.empty((count, len(discs.DIAMETERS)), np.uintp)
         passes = np.empty(count * (len(discs.DIAMETERS) + 3), PASS)
-        held = self._held, self._source, self._diameter, self._levels_source
+        held = self._held, self._source, self._diameter
         frames = indices, slots, blurs, source, float(sum(self._shape[1:])), discs.radius_table()
         while done < count:
             if lacking:
@@ -335,9 +334,9 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
         The frames that are done, the passes, and how many places lack.
     """
     indices, slots, blurs, source, longest, table = frames
-    held, sources, diameters, levels_source = memory
+    held, sources, diameters = memory
     (free, left), (light, levels, passes) = spare, made
-    needed, lens = np.zeros(len(_KNOTS), np.bool_), sources.shape[1]
+    needed, lens = np.zeros(len(_KNOTS), np.bool_), diameters.shape[1]
     for k in range(done, len(indices)):
         scene, slot, blur, at = indices[k], slots[k], blurs[k], source[k]
         diameter, blends, moved = blur.defocus_px, blur.diameter > 0, held.shape[1] - 2
@@ -347,16 +346,15 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
         changes = blur.motion_px > 0.0 or blur.vignetting > 0
         needed[:] = False
         if new and blends:
-            if levels_source[scene] != at:
-                _give_up(held[scene, lens:moved], free, left)
-                levels_source[scene] = at
             sorts = _array_at(blur.sorts, (blur.num_sorts,))
             discs.mark_levels(sorts, np.float32(diameter), _HALF_STEP, _KNOTS, needed)
             needed[0] = False
         lacking = (new and not held[scene, slot]) + (changes and not held[scene, moved])
         for level in range(len(needed)):
-            needed[level] &= not held[scene, lens + level]
-            lacking += needed[level]
+            if held[scene, lens + level]:
+                needed[level] &= sources[scene, lens + level] != at
+            else:
+                lacking += needed[level]
         if lacking > left[0]:
             return k, planned, lacking - left[0]
         light[k], levels[k, :] = at, at  # levels without a share are read, too, times 0
@@ -364,8 +362,9 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
             for level in range(len(needed) if blends else 0):
                 if needed[level]:
                     to = _hold(held[scene], lens + level, free, left)
+                    sources[scene, lens + level] = at
                     planned = _add_disc(passes, planned, k, scene, at, to, _DISCS[level], table)
-                if held[scene, lens + level]:
+                if held[scene, lens + level] and sources[scene, lens + level] == at:
                     levels[k, level] = held[scene, lens + level]
             to = _hold(held[scene], slot, free, left)
             sources[scene, slot], diameters[scene, slot] = at, diameter
@@ -387,15 +386,6 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
                 planned = _add(passes, planned, DARKEN, k, scene, light[k], to, 20.0)
             light[k] = to
     return len(indices), planned, 0
-
-
-@_jit()
-def _give_up(held, free, left):  # type: ignore[no-untyped-def]
-    """Makes all places free that are `held`."""
-    for place in range(len(held)):
-        if held[place]:
-            free[left[0]], held[place] = held[place], 0
-            left[0] += 1
 
 
 @_jit()
