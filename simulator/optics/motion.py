@@ -1,20 +1,15 @@
 """Motion: how an image moves while the shutter is open, and the blur that this makes.
 
-Along the rows it is a streak, in other directions a path: the shake of a camera has a direction
-that turns, and a subject may move on its own besides. A path is rasterised into a few weighted
-shifts (taps), whose sum is the blurred image.
+Along the rows it is a streak, in other directions a path: a few weighted shifts (taps), whose sum
+is the blurred image. Both have the second moment of the path (of a streak its extent squared / 12):
+a kernel that averages the pixels it covers would do nothing below one pixel. They work on
+*unclipped* light, so that a lamp ten times above white smears into a streak that is still white:
+clipping comes later, once (see `simulator.capture.sensor`). Borders are replicated.
 
-A kernel that merely averages the pixels it covers does nothing below one pixel of extent. Streaks
-and taps are widened so that their second moment is that of the path (of a streak its extent squared
-/ 12): small blurs are then right, too. Both work on *unclipped* light, so that a lamp ten times
-above white smears into a streak that is still white: clipping comes later, once (see
-`simulator.capture.sensor`). Borders are replicated.
-
-On the CPU, streaks run row by row in compiled kernels; a row and what is summed of it stay in the
-first-level cache. A streak is a box of equal weights with a share of one more pixel at each end.
-The box is put together from sums over 1, 2, 4, 8, ... pixels, each the sum of two of the former: a
-streak of n pixels takes about 2 log2(n) additions, and no running sum that would lose the shadows
-beside a lamp.
+On the CPU, rows and what is summed of them stay in the first-level cache. A streak, a box of equal
+weights with a share of one more pixel at each end, is put together from sums over 1, 2, 4, 8, ...
+pixels, each the sum of two of the former: n pixels take about 2 log2(n) additions, and no running
+sum that would lose the shadows beside a lamp.
 """
 
 from __future__ import annotations
