@@ -112,8 +112,12 @@ def _accumulate(first, last, light, rows, edges, bins):  # type: ignore[no-untyp
 
 @kernel(fastmath=SUMS, boundscheck=False)
 def excess_error(share, edges, ratio, source, target):  # type: ignore[no-untyped-def]
-    """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
-    total = 0.0
+    """Error of leaving a source's noise where it exceeds the target's, rather too high.
+
+    Over bins. Noises are (2, P) shot and read: that of the `source` at its own exposure, and that
+    which the `target` should have; `ratio` is the exposure of the target over the source's.
+    """
+    total = 0.0  # squares at both edges of a bin: in between it is monotonic, mostly convex
     for plane in range(share.shape[0]):
         source_shot = source[0, plane] * ratio * ratio
         source_read = source[1, plane] * ratio * ratio
@@ -132,7 +136,12 @@ def excess_error(share, edges, ratio, source, target):  # type: ignore[no-untype
 
 @kernel(fastmath=SUMS, boundscheck=False)
 def curvature(columns, ratio, target):  # type: ignore[no-untyped-def]
-    """`LightStatistics.curvature` of its `columns`; `target` is (2, P) shot and read noise."""
+    """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
+
+    Of `LightStatistics.columns`. Others go with the square of their extent. A symmetric kernel with
+    second moment m per axis moves the light by at most m / 2 times its discrete Laplacian, in the
+    root mean square: ``1 - cos(k t) <= k^2 (1 - cos t)``. See `excess_error` for the noise.
+    """
     discs, rows = 0.0, 0.0
     for plane in range(columns.shape[1]):
         shot, read = target[0, plane], target[1, plane]
@@ -149,7 +158,7 @@ def curvature(columns, ratio, target):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath=SUMS, boundscheck=False)
 def relative_level(share, light, ratio, target):  # type: ignore[no-untyped-def]
-    """`LightStatistics.relative_level` of bins; `target` is (2, P) shot and read noise."""
+    """Root mean square of the signal in units of the target's noise, over bins."""
     total = 0.0
     for plane in range(share.shape[0]):
         for index in range(share.shape[1]):
@@ -177,7 +186,11 @@ def variance_beyond(share, light, ratio, source, target, least):  # type: ignore
 
 @kernel(fastmath=SUMS, boundscheck=False)
 def blur_change(share, light, disc, ratio, source, target, noise):  # type: ignore[no-untyped-def]
-    """`LightStatistics.blur_change` of bins; noises are (2, P) shot and read."""
+    """What a disc of one pixel changes, in units of the target's noise; other than in `curvature`
+    estimated, not bounded: the noise of the light itself is taken out.
+
+    With `noise` a capture is wanted, in which what is surely white shows no change.
+    """
     total = 0.0
     for plane in range(share.shape[0]):
         for index in range(share.shape[1]):
@@ -214,35 +227,10 @@ def hidden_highlights(ratio, target, share, estimate):  # type: ignore[no-untype
 
 
 class LightStatistics:
-    """Noise and curvature of a light, by its levels; each value is computed when first needed.
-
-    The first answer takes a pass over the pixels, the others a few microseconds each. Where its
-    methods say nothing else, they take the exposure `ratio` from the light to the target, the noise
-    `source` of the light at its own exposure, and the noise `target` that the capture should have.
-    The light is (4, H, W) at the reference exposure.
-    """
+    """Noise and curvature of a light (4, H, W), by its levels; a pass when first needed."""
 
     def __init__(self, light: torch.Tensor) -> None:
         self.light = light
-
-    def excess_error(
-        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
-    ) -> float:
-        """Error of leaving a source's noise where it exceeds the target's, rather too high."""
-        bins = self._bins
-        # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
-        noises = noise_numbers(source), noise_numbers(target)
-        return float(excess_error(bins[0], bins[1:3], float(ratio), *noises))
-
-    def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
-        """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
-
-        Others go with the square of their extent. A symmetric kernel with second moment m per axis
-        moves the light by at most m / 2 times its discrete Laplacian, in the root mean square:
-        ``1 - cos(k t) <= k^2 (1 - cos t)``.
-        """
-        disc, row = curvature(self.columns, float(ratio), noise_numbers(target))
-        return float(disc), float(row)
 
     @functools.cached_property
     def columns(self) -> np.ndarray:
@@ -254,30 +242,6 @@ class LightStatistics:
     def noise_columns(self) -> np.ndarray:
         """(4, P, B): share, least, most and mean light of bins, for errors of a source's noise."""
         return self._bins[:4]
-
-    def blur_change(
-        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction, *, noise: bool
-    ) -> float:
-        """What a disc of one pixel changes, in units of the target's noise; other than in
-        `curvature` estimated, not bounded: the noise of the light itself is taken out.
-
-        With `noise` a capture is wanted, in which what is surely white shows no change.
-        """
-        bins, noises = self._bins, (noise_numbers(source), noise_numbers(target))
-        return float(blur_change(bins[0], bins[3], bins[4], float(ratio), *noises, noise))
-
-    def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
-        """Root mean square of the signal in units of the target's noise."""
-        bins = self._bins
-        return float(relative_level(bins[0], bins[3], float(ratio), noise_numbers(target)))
-
-    def relative_noise(
-        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
-    ) -> float:
-        """Root mean square of the exposed source's noise in units of the target's."""
-        bins, exposed = self._bins, source.exposed(ratio)
-        noises = noise_numbers(exposed), noise_numbers(target)
-        return math.sqrt(variance_beyond(bins[0], bins[3], float(ratio), *noises, 0.0))
 
     @functools.cached_property
     def _bins(self) -> np.ndarray:

@@ -63,24 +63,6 @@ class Movement:
         if not all(math.isfinite(number) for number in numbers) or self.subject_speed < 0.0:
             raise ValueError(f"`movement` (={self}) must be finite, its `subject_speed` >= 0")
 
-    @property
-    def along_rows(self) -> bool:
-        """Whether the shake makes a straight streak along the rows."""
-        return self.turn == 0.0 and self.direction == 0.0
-
-    def path(self, speed: float, time: float, height: int) -> Path:
-        """Path of the background, as the camera shakes at `speed` [frame heights per second].
-
-        The shutter is open for `time` [s], the frame `height` pixels high.
-        """
-        return Path(speed * time * height, self.direction, self.turn * time)
-
-    def subject_path(self, speed: float, time: float, height: int) -> Path:
-        """Path of the subject: that of the background and its own; see `path`."""
-        own, angle = self.subject_speed * time * height, self.subject_direction
-        shake = self.path(speed, time, height)
-        return shake._replace(drift_x=own * math.cos(angle), drift_y=own * math.sin(angle))
-
 
 #: That of an image which moves along the rows, wherever it has a speed.
 ALONG_ROWS = Movement()

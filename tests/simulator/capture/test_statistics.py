@@ -69,8 +69,15 @@ def variance(signal: np.ndarray, iso: float) -> np.ndarray:
 
 def blur_error(statistics, ratio, target, streak=0.0, disc=0.0):
     """Bound on the error of leaving out a blur of these extents [pixel]."""
-    per_disc, per_streak = statistics.curvature(ratio, target)
+    noises = module.noise_numbers(target)
+    per_disc, per_streak = module.curvature(statistics.columns, ratio, noises)
     return per_disc * disc**2 + per_streak * streak**2
+
+
+def excess_error(statistics, ratio, *noises):
+    """Of leaving the noise of a source, where that of a target is wanted."""
+    bins = statistics.noise_columns
+    return module.excess_error(bins[0], bins[1:3], ratio, *map(module.noise_numbers, noises))
 
 
 def tensor(light: np.ndarray) -> torch.Tensor:
@@ -88,7 +95,7 @@ def test_excess_bounds_that_of_all_pixels_closely(name: str, ratio: float) -> No
         spread = np.maximum(np.sqrt(given) - np.sqrt(wanted), 0.0)
         spread[ratio * light - 4.0 * np.sqrt(given) > 1.0] = 0.0  # white in any case
         expected = exact(light, ratio, np.zeros_like(light), spread, target)
-        stated = statistics.excess_error(ratio, first, second)
+        stated = excess_error(statistics, ratio, first, second)
         # White noise has pixels much darker than the rest of their bin.
         assert 0.998 * expected <= stated <= 1.1 * expected + 0.07
 
@@ -99,13 +106,15 @@ def test_excess_of_a_grey_patch_by_hand() -> None:
     source = nlf(2e-5, 4e-6)
     target = nlf(1e-5, 1e-6)
     statistics = LightStatistics(torch.full((4, 8, 8), 0.1))
-    assert statistics.excess_error(2.0, source, target) == pytest.approx(math.sqrt(8) - 1, rel=1e-6)
+    assert excess_error(statistics, 2.0, source, target) == pytest.approx(
+        math.sqrt(8) - 1, rel=1e-6
+    )
     half = torch.full((4, 8, 8), 0.1)
     half[..., :4] = 0.9  # white in the capture, whatever its noise
-    error = LightStatistics(half).excess_error(2.0, source, target)
+    error = excess_error(LightStatistics(half), 2.0, source, target)
     assert error == pytest.approx((math.sqrt(8) - 1) / math.sqrt(2), rel=1e-6)
-    assert statistics.excess_error(1.0, target, source) == 0.0
-    assert statistics.excess_error(1.0, ZERO, target) == 0.0
+    assert excess_error(statistics, 1.0, target, source) == 0.0
+    assert excess_error(statistics, 1.0, ZERO, target) == 0.0
 
 
 def test_levels_in_units_of_the_noise() -> None:
@@ -113,11 +122,14 @@ def test_levels_in_units_of_the_noise() -> None:
     statistics = LightStatistics(tensor(light))
     zero = np.zeros_like(light)
     expected = exact(light, 3.0, 3.0 * light, zero, 400)
-    assert statistics.relative_level(3.0, Z6.nlf(400)) == pytest.approx(expected, rel=0.01)
+    bins, target = statistics.noise_columns, module.noise_numbers(Z6.nlf(400))
+    level = module.relative_level(bins[0], bins[3], 3.0, target)
+    assert level == pytest.approx(expected, rel=0.01)
     expected = exact(light, 3.0, zero, 3.0 * np.sqrt(variance(light, 1600)), 400)
-    found = statistics.relative_noise(3.0, Z6.nlf(1600), Z6.nlf(400))
+    exposed = module.noise_numbers(Z6.nlf(1600).exposed(3.0))
+    found = math.sqrt(module.variance_beyond(bins[0], bins[3], 3.0, exposed, target, 0.0))
     assert found == pytest.approx(expected, rel=0.01)
-    assert statistics.excess_error(1.0, Z6.nlf(100), ZERO) > 1e6  # without noise all is seen
+    assert excess_error(statistics, 1.0, Z6.nlf(100), ZERO) > 1e6  # without noise all is seen
     assert blur_error(statistics, 1.0, ZERO, 0.01, 0.0) > 1e6
 
 
@@ -148,7 +160,7 @@ def test_any_size_and_light(shape: tuple[int, int], extreme: bool) -> None:
         light.reshape(4, -1)[:, :3] = np.array([3e38, -3e38, -0.07])[: light[0].size]
     statistics = LightStatistics(tensor(light))
     for ratio in (1e-12, 1.0, 1e12):
-        error = statistics.excess_error(ratio, Z6.nlf(6400), Z6.nlf(100))
+        error = excess_error(statistics, ratio, Z6.nlf(6400), Z6.nlf(100))
         assert math.isfinite(error)
         assert error > 1.0 or ratio != 1.0 or extreme
         assert 0.0 <= blur_error(statistics, ratio, Z6.nlf(100), 1.0, 1.0) < math.inf

@@ -19,6 +19,7 @@ from simulator.optics import discs, motion
 from simulator.optics.discs import DIAMETERS, DiscBank, disc_blur, disc_kernel
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
 from simulator.optics.motion import Movement, Path, motion_blur, path_blur, path_taps
+from tests.simulator.tables import streak_kernel
 
 # -- paths -----------------------------------------------------------------------------------------
 PATHS = [
@@ -29,7 +30,6 @@ PATHS = [
     Path(9.0, 1.0, 0.5, drift_x=-6.0, drift_y=4.0),
     Path(0.0, drift_x=3.0, drift_y=-5.0),
 ]
-from tests.simulator.tables import streak_kernel
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -48,11 +48,7 @@ def test_taps_have_the_moments_of_the_path(path: Path) -> None:
         assert (weights * places**2).sum() == pytest.approx(wanted, rel=2e-3, abs=1e-6)
 
 
-def test_a_movement_makes_paths_in_pixels() -> None:
-    movement = Movement(0.5, 2.0, subject_speed=0.3, subject_direction=math.pi / 2)
-    assert movement.path(0.2, 0.5, 64) == Path(6.4, 0.5, 1.0)
-    own = movement.subject_path(0.2, 0.5, 64)
-    assert own == pytest.approx((6.4, 0.5, 1.0, 0.0, 9.6))
+def test_bad_movements_are_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
         Movement(turn=math.inf)
 
