@@ -112,26 +112,11 @@ def _periods(
     start: np.ndarray, time: np.ndarray, frequency: float, phase: float, more: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Begin within a period, in [0, 1); whole periods that exposures last; the rest, in [0, 1)."""
-    (turns, missing), phases = _product(start, frequency), phase + more
-    # Each exact: what is left of a day of periods must still tell where in one it is.
-    begin = (turns - np.floor(turns)) + (phases - np.floor(phases)) + missing
-    begin = begin - np.floor(begin)  # as by `np.mod`, which takes longer
-    span, missing = _product(time, frequency)
+    # A whole second of whole periods changes nothing: without it, what is left of a day of periods
+    # still tells where in one it is, as well as the rounding of `start` lets it.
+    seconds = np.floor(start)
+    turns = (start - seconds) * frequency + seconds * (frequency - math.floor(frequency))
+    phases, span = phase + more, time * frequency
+    begin = (turns - np.floor(turns)) + (phases - np.floor(phases))
     whole = np.floor(span)
-    rest = span - whole + missing
-    return begin, whole - (rest < 0.0), rest + (rest < 0.0)
-
-
-def _product(values: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """The product as float64 rounds it, and what the rounding left out (Dekker 1971)."""
-    rounded = values * factor
-    (high, low), (factor_high, factor_low) = _halves(values), _halves(np.asarray(factor))
-    left_out = high * factor_high - rounded + high * factor_low + low * factor_high
-    return rounded, left_out + low * factor_low
-
-
-def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two numbers of 26 bits each that add up to each value (Veltkamp 1968)."""
-    scaled = values * (2.0**27 + 1.0)
-    high = scaled - (scaled - values)
-    return high, values - high
+    return begin - np.floor(begin), whole, span - whole  # as by `np.mod`, which takes longer
