@@ -18,7 +18,6 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.capture import blurred_frames, columns
 from simulator.capture.blurred_light import new_frames
-from simulator.capture.limits import MAX_DISC_PX
 from simulator.capture.plan import noise_balances, opening_errors
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import CodeMeans, Transitions, record, record_units
@@ -149,7 +148,6 @@ class CaptureBatch:
         self._scene_columns = np.zeros(num_scenes, columns.SCENE)
         self._rest = np.full(num_scenes, -1)
         self._size = tuple[int, ...]()  # of all lights
-        self._widest, self._any_wide = 0.0, False  # the largest defocus, and whether any is larger
         # Of scenes at rest, what those that show them in motion share: the light, as recorded and
         # denoised, and its places, the vignetting, the noise of the light if any scene's has some,
         # and the statistics, where they are known.
@@ -322,8 +320,10 @@ class CaptureBatch:
             rest, moves = self._moved(indices)
             for index in np.unique(rest[(rest >= 0) & ~self._known[rest]]).tolist():
                 self._add_alone(index)
-            inside = (rest >= 0) & (self._rest[rest] >= 0) & (moves["defocus"] <= self._widest)
+            inside = rest >= 0
             new, rest = indices[inside], rest[inside]
+            widest = moves["defocus"][inside].max(initial=0.0).item()
+            columns.check_disc(widest, self._apertures[0].item(), self._size)
             self._scene_columns[new] = self._scene_columns[rest]
             for name in columns.MOVES.names or ():
                 self._scene_columns[name][new] = moves[name][inside]
@@ -339,7 +339,7 @@ class CaptureBatch:
         scene = self.prepared_scene(index)
         light, self._size = scene.light.contiguous(), tuple(scene.light.shape[-2:])
         self._light[index] = light, light
-        self._widest = max(*self._size, MAX_DISC_PX) * self._apertures.min().item() / 4.0
+        columns.check_disc(scene.defocus, self._apertures[0].item(), self._size)
         box = scene.box_factor
         if box not in self._boxes:
             self._boxes.append(box)
@@ -353,7 +353,6 @@ class CaptureBatch:
         self._opening[index] = columns.opening_column(scene, self._columns)
         assert len(scene.denoised_lights) < 2  # as those of environments have
         self._rest[index] = index
-        self._any_wide |= scene.defocus > self._widest
         self._scene_columns[index] = columns.scene_column(scene, number, index)
         self._statistics[index] = found = columns.statistics_column(scene)
         self._counted[index] = found.any()
@@ -375,11 +374,6 @@ class CaptureBatch:
         unknown = ~self._known[indices]
         if np.count_nonzero(unknown):
             self._add(np.unique(indices[unknown]))
-        if self._any_wide:
-            defocus, numbers = self._scene_columns["defocus"][indices], self._columns["f_number"]
-            for i in np.flatnonzero(defocus > self._widest).tolist():  # where it is an error
-                f_number = numbers.item(rows[i] % len(self.states))
-                columns.check_disc(defocus.item(i), f_number, self._size)
         self._gain[rows] = np.nan  # what is interrupted stays unknown
         captures = self.noise is not None
         self._plan_rows(indices, rows, gains, captures)
