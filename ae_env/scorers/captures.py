@@ -253,7 +253,7 @@ def source_noises(
     if prepared.nlf.is_zero:
         return None
     gains = np.broadcast_to(gain, len(states))
-    planned = plan_captures(prepared, states, gains, noise=True)
+    planned = plan_captures(prepared, states, gains)
     lights = [prepared.light] * len(states)
     averaged = Transitions(lights, planned.table, planned.shares).averaged_table()
     noises = averaged[:, 3:].astype(float) * prepared.box_factor**2

@@ -452,9 +452,9 @@ class Planned(NamedTuple):
 def plan_captures(
     scene: PreparedScene,
     states: Sequence[CameraSettings],
-    gains: np.ndarray,
+    gains: np.ndarray | None = None,
     *,
-    noise: bool,
+    noise: bool = True,
     errors: bool = False,
 ) -> Planned:
     """Captures of a scene at S states, in light (S,) relative to its own, or without `noise`.
@@ -474,7 +474,7 @@ def plan_captures(
     targets = noise_columns(scene.camera, states, scene.box_factor)[None]
     bits = np.array([1, NETWORKS + 1, 0, 0, 0, 0, 0])  # of noise reduction and aperture alone
     camera = columns, targets, tuple(scene.light.shape[-2:]), bits, blur_tables()
-    given = 0 * rows, rows, gains.astype(float), noise
+    given = 0 * rows, rows, np.ones(count) if gains is None else gains.astype(float), noise
     plan_frames(0, count, known, noises, camera, given, (*made, details))
     while (modules < 0).any():
         assert noises is not None

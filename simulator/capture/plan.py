@@ -242,7 +242,7 @@ def plan_capture(
     scene: PreparedScene, settings: CameraSettings, *, noise: bool = True
 ) -> SimulationPlan:
     """The plan of a capture of a scene at `settings`, or of its light without `noise`."""
-    planned = plan_captures(scene, [settings], np.ones(1), noise=noise, errors=True)
+    planned = plan_captures(scene, [settings], noise=noise, errors=True)
     targets = noise_columns(scene.camera, [settings], scene.box_factor)
     excess, lacks = 0.0, bool(targets.any())
     if planned.table[0, 3:].any():  # else the light need not be made to see that

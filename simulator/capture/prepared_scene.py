@@ -179,7 +179,7 @@ class PreparedScene:
 
         Shot and read noise are compared apart: a mixed case is stated too high, not too low.
         """
-        planned = plan_captures(self, [settings], np.ones(1), noise=True)
+        planned = plan_captures(self, [settings])
         beyond = np.maximum(-planned.table[0, 1:3].astype(float), 0.0) * self.box_factor**2
         nlf = self.camera.nlf(settings.iso, settings.exposure_time)
         shot, read = (np.array([nlf.shot, nlf.read]) + beyond).tolist()
@@ -280,8 +280,7 @@ class PreparedScene:
         """
         if not states:
             return
-        gains = np.ones(len(states)) if gain is None else gain
-        planned = plan_captures(self, states, gains, noise=noise)
+        planned = plan_captures(self, states, gain, noise=noise)
         extents = planned.blurs[["defocus_px", "motion_px"]].tolist()
         kinds, parts = [*zip(planned.origins, extents, strict=True)], [slice(0, len(states))]
         ranks = {kind: rank for rank, kind in enumerate(kinds)}

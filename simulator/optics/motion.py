@@ -77,15 +77,10 @@ class Path(NamedTuple):
     drift_x: float = 0.0  # how far it drifts along the rows meanwhile [pixel]
     drift_y: float = 0.0  # the same down the columns [pixel]
 
-    @property
-    def length(self) -> float:
-        """Length of the whole path [pixel]."""
-        return float(path_length(*self))
-
 
 @_jit()
 def path_length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyped-def]
-    """`Path.length`, by the midpoint rule."""
+    """Length of a `Path` [pixel], by the midpoint rule."""
     if drift_x == 0.0 and drift_y == 0.0:
         return extent
     total = 0.0

@@ -16,7 +16,7 @@ from simulator.capture import blurred_frames
 from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
-from simulator.capture.columns import Planned, noise_columns, plan_captures
+from simulator.capture.columns import noise_columns, plan_captures
 from simulator.capture.plan import noise_balances
 from simulator.capture.sensor import record
 from simulator.capture.statistics import DenoisedLight, Residual
@@ -154,10 +154,6 @@ DRIFT = 0.4 * 0.5 * SIZE
 OWN = SHAKE._replace(drift_x=DRIFT * math.cos(2.0), drift_y=DRIFT * math.sin(2.0))
 
 
-def planned(scene: PreparedScene) -> Planned:
-    return plan_captures(scene, [SLOW], np.ones(1), noise=True)
-
-
 def _layout() -> Layout:
     """Halves in and out of focus, and a subject across them."""
     defocus = torch.zeros(SIZE, SIZE)
@@ -175,7 +171,7 @@ def _prepared(noisy=False, **fields):
 
 def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
     whole = Layout(torch.zeros(SIZE, SIZE))
-    (blur,) = planned(_prepared(layout=whole, image_speed=0.3)).blurs
+    (blur,) = plan_captures(_prepared(layout=whole, image_speed=0.3), [SLOW]).blurs
     assert [blur[n].item() for n in ("extent", "direction", "turn", "mask")] == [*SHAKE[:3], 0]
     assert blur["motion_px"] == pytest.approx(0.3 * 0.5 * SIZE)
     found = _prepared(layout=None, image_speed=0.3).expected(SLOW)
@@ -183,7 +179,7 @@ def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
     along_rows = _prepared(layout=None, movement=Movement(subject_speed=2.0), image_speed=0.3)
     plain = PreparedScene(SCENE, REFERENCE, Z6, ZERO, image_speed=0.3)
     assert torch.equal(plain.expected(SLOW), along_rows.expected(SLOW))
-    assert planned(along_rows).blurs["streaks"].all()
+    assert plan_captures(along_rows, [SLOW]).blurs["streaks"].all()
 
 
 @pytest.mark.parametrize("defocus", [0.0, 5.0])
@@ -192,7 +188,7 @@ def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
 def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement) -> None:
     """The variance of blurred white noise, over many draws."""
     scene = _prepared(noisy=True, defocus=defocus, image_speed=speed, movement=movement)
-    (blur,), (left,), (table,) = (found := planned(scene))[1], found.shares, found.table
+    _, (blur,), (table,), (left,), _ = plan_captures(scene, [SLOW])
     share = table[3].item(0) / (SLOW_RATIO * Z6.nlf(800).shot[0])
     share = torch.full((SIZE, SIZE), share) if left is None else share * left
     draws = torch.randn(600, SIZE, SIZE, generator=torch.Generator().manual_seed(3))
@@ -372,7 +368,7 @@ def test_a_sweep_is_planned_as_each_state_alone(noise) -> None:
     )
     opens = NetworkApertureBlur(family[2], lambda image, *_: 0.9 * image, 4.0)
     scenes = [replace(prepared(1), denoised_lights=family, tolerance=0.1 * i) for i in range(4)]
-    plan_captures(scenes[3], STATES[-1:], np.ones(1), noise=True)
+    plan_captures(scenes[3], STATES[-1:])
     assert not any(network.shape for network in family)  # none has run: the target is noisier
     scenes += [replace(scene, aperture_blur=opens) for scene in scenes]
     for scene in (*map(prepared, range(10)), *scenes):

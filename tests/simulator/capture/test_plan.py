@@ -167,7 +167,7 @@ def posed(tolerance, found, networks=(), *, opened_px=None, source=SHOT, **rest)
 
 def decided(*given, noise=True, **options):
     """What is decided at the settings of the source."""
-    return plan_captures(posed(*given, **options), [SOURCE], np.ones(1), noise=noise)
+    return plan_captures(posed(*given, **options), [SOURCE], noise=noise)
 
 
 def errors(made) -> dict[str, float]:

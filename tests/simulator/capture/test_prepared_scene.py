@@ -70,7 +70,7 @@ def prepared(level=0.2, reference=HIGH, **changes):
 )
 def test_denoised_light_is_used_where_the_source_is_noisier(reference, target, denoised):
     source = prepared(reference=reference)
-    planned = planned_for(source, target)
+    planned = columns.plan_captures(source, [target])
     assert (planned.origins[0][0] is not None) is denoised
     assert planned.table[0, 3:].any() != denoised
     assert torch.equal(source.blurred_light.source(planned.origins[0]), flat(0.2)) is denoised
@@ -104,10 +104,6 @@ def test_noise_is_compared_with_the_averaged_sensors() -> None:
     assert prepared(nlf=Z6.nlf(6400), box_factor=4).plan(HIGH).network
 
 
-def planned_for(scene: PreparedScene, settings: CameraSettings) -> columns.Planned:
-    return columns.plan_captures(scene, [settings], np.ones(1), noise=True)
-
-
 def with_detail(source: PreparedScene) -> PreparedScene:
     """A chequered corner of 8 pixels: a blur of flat light would be left out."""
     board = torch.zeros(SIDE, SIDE)
@@ -127,7 +123,7 @@ def test_noise_that_the_blur_removed_is_topped_up(diameter: float, level: float)
     """f/8 to f/4 at the same exposure and ISO: what blur takes of the noise is added again."""
     source = with_aperture_blur(with_detail(prepared(level)), diameter)
     target = CameraSettings(6400, 1 / 256, 4)
-    planned = planned_for(source, target)
+    planned = columns.plan_captures(source, [target])
     assert (planned.table[:, 0] == 1.0).all()
     assert planned.origins == [(None, 4.0)]
     blurred = variance(source.expected(target)[:, 16:-16, 16:-16])
@@ -145,7 +141,7 @@ def test_the_papers_network_always_opens_denoised_light() -> None:
     cheap, clean = DenoisedLight(light), DenoisedLight(light)
     small = PreparedScene(light, HIGH, Z6, Z6.nlf(6400), denoised_lights=(cheap, clean))
     source = replace(small, aperture_blur=NetworkApertureBlur(clean, pytest.fail, 8.0))
-    planned = planned_for(source, CameraSettings(6400, 1 / 256, 4))
+    planned = columns.plan_captures(source, [CameraSettings(6400, 1 / 256, 4)])
     assert planned.origins == [(clean, 4.0)]  # by the best network
     assert planned.shares == [None]
     assert source.plan(HIGH).network is None
@@ -164,7 +160,7 @@ def test_blur_of_a_wave_by_hand(blur: str, factor: float) -> None:
     camera = replace(Z6, nlf_by_iso={100.0: noise}, segments=())
     made = PreparedScene(light.expand(4, SIDE, SIDE), settings, camera, NoiseLevelFunction.zero())
     scene = {"defocus": 0.8} if blur == "defocus" else {"image_speed": 0.4 * 64 / SIDE}
-    planned = planned_for(replace(made, tolerance=factor * error, **scene), settings)
+    planned = columns.plan_captures(replace(made, tolerance=factor * error, **scene), [settings])
     (found,) = planned.details[:, columns.ERRORS.index(blur)]
     assert found == pytest.approx(error, rel=1e-4)
     (applied,) = planned.blurs["defocus_px" if blur == "defocus" else "motion_px"]
