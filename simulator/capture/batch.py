@@ -116,9 +116,10 @@ class CaptureBatch:
     `prepared` returns the scene of an index, in its own light, when it is first photographed. Of
     indices (K,), `moved` returns the scenes that they show in motion, -1 for none, and how these
     move, `MOVES` (K,). The light behind the lens at every f-number is cached until a scene is
-    forgotten, as long as all takes no more than `light_bytes`. Everything is planned on the CPU;
-    light is blurred and frames are recorded there by compiled loops or, with a `device`, by torch
-    operations on it. A pickled copy works everything out again.
+    forgotten, as long as all takes no more than `light_bytes`; that behind opened apertures, and
+    what these leave of its noise, in any case. Everything is planned on the CPU; light is blurred
+    and frames are recorded there by compiled loops or, with a `device`, by torch operations on it.
+    A pickled copy works everything out again.
     """
 
     def __init__(
@@ -342,18 +343,18 @@ class CaptureBatch:
         columns.check_disc(scene.defocus, self._apertures[0].item(), self._size)
         box = scene.box_factor
         if box not in self._boxes:
-            self._boxes.append(box)
+            boxes = [*self._boxes, box]
             own = columns.noise_columns(self.camera, self.states, box)
-            self._targets = np.stack([*self._targets, own])
+            self._targets = np.stack([*self._targets[: len(self._boxes)], own])
             if self.noise == "sensor":
-                each = [self.camera.read_noise(s.iso, b) for b in self._boxes for s in self.states]
+                each = [self.camera.read_noise(s.iso, b) for b in boxes for s in self.states]
                 self._read_noise = ReadNoises.of(each)
-        self._scene_columns["targets"][index] = number = self._boxes.index(box)
+            self._boxes = boxes  # last: what is interrupted is made again
         self._vignetting[index] = columns.vignetting_column(scene, self.states)
         self._opening[index] = columns.opening_column(scene, self._columns)
         assert len(scene.denoised_lights) < 2  # as those of environments have
         self._rest[index] = index
-        self._scene_columns[index] = columns.scene_column(scene, number, index)
+        self._scene_columns[index] = columns.scene_column(scene, self._boxes.index(box), index)
         self._statistics[index] = found = columns.statistics_column(scene)
         self._counted[index] = found.any()
         if not scene.nlf.is_zero:
@@ -453,7 +454,7 @@ class CaptureBatch:
                 self._excess_variance[rows], _ = noise_balances(*made, self._target_noise(rows))
 
     def _open(self, rows: np.ndarray) -> list[torch.Tensor]:
-        """Light behind the open apertures of rows (K,); that of a scene stays until it goes."""
+        """Light behind the open apertures of rows (K,); it stays until its scene is forgotten."""
         keys = []
         for row in rows.tolist():
             index, state = divmod(row, len(self.states))

@@ -219,9 +219,11 @@ class BlurredLight:
             return [self.source(origin) for origin in origins]
         lens, fields = np.zeros_like(blurs), ["defocus_px", "diameter", "sorts", "num_sorts"]
         lens[fields] = blurs[fields]
+        still = lens.copy()  # where nothing moves, its path makes no other light
+        still["vignetting"] = blurs["vignetting"]
+        blurs = np.where(blurs["motion_px"] > 0.0, blurs, still)
         # Blurs that change what is behind the disc of defocus.
         changes = (blurs["motion_px"] > 0.0) | (blurs["vignetting"] > 0)
-        blurs = np.where(changes, blurs, lens)
         numbers = blurs.view(f"V{BLUR.itemsize}").tolist()
         keys = [(*key, owners) for key in zip(origins, numbers, strict=True)]
         found = {key: self._cache.get(key) for key in set(keys)}

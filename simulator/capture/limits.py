@@ -7,9 +7,6 @@ from simulator.utils.checks import check_number
 #: Error that a capture may have, in units of the target's noise: by default the distribution of a
 #: pixel may move by a tenth of its noise's standard deviation.
 DEFAULT_TOLERANCE = 0.1
-#: Relative error of the noise's standard deviation for each stop of ISO beyond the calibration:
-#: without their last ISOs the Z6's table is off by 0.03 to 0.05, the 70D's by 0.17 to 0.25.
-EXTRAPOLATION_ERROR = 0.1
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
 SIGNAL_LIMIT = 1e6

@@ -25,7 +25,7 @@ from simulator.optics.motion import ALONG_ROWS, Movement
 from simulator.optics.vignetting import Vignetting
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings
-from simulator.utils.checks import check_number, check_type, check_word
+from simulator.utils.checks import check_flag, check_number, check_type, check_word
 
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
@@ -87,9 +87,6 @@ class PreparedScene:
             statistics = None if cached is None else cached.statistics
             lights = BlurredLight(self.light, self.nlf, self.aperture_blur, statistics)
             object.__setattr__(self, "blurred_light", lights)
-        if len(self.denoised_lights) > NETWORKS:
-            count = len(self.denoised_lights)
-            raise ValueError(f"`denoised_lights` (length {count}) must be at most {NETWORKS}")
         for denoised in self.denoised_lights:
             check_type("denoised_lights", denoised, DenoisedLight)
             if denoised.shape not in (None, self.light.shape):
@@ -97,6 +94,9 @@ class PreparedScene:
                     f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
                     f"`light`, {tuple(self.light.shape)}"
                 )
+        if len(self.denoised_lights) > NETWORKS:
+            count = len(self.denoised_lights)
+            raise ValueError(f"`denoised_lights` (length {count}) must be at most {NETWORKS}")
         unit = " frame heights per second"
         check_number("image_speed", self.image_speed, 0.0, MAX_IMAGE_SPEED, more=unit)
         check_number("defocus", self.defocus, 0.0, sys.float_info.max)
@@ -172,6 +172,7 @@ class PreparedScene:
     def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
         """Steps, reasons, error and cost of a capture at `settings`, or without `noise`."""
         check_type("settings", settings, CameraSettings)
+        check_flag("noise", noise)
         return plan_capture(self, settings, noise=noise)
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
@@ -179,6 +180,7 @@ class PreparedScene:
 
         Shot and read noise are compared apart: a mixed case is stated too high, not too low.
         """
+        check_type("settings", settings, CameraSettings)
         planned = plan_captures(self, [settings])
         beyond = np.maximum(-planned.table[0, 1:3].astype(float), 0.0) * self.box_factor**2
         nlf = self.camera.nlf(settings.iso, settings.exposure_time)
@@ -188,7 +190,11 @@ class PreparedScene:
     # -- captures -----------------------------------------------------------------------------
 
     def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
-        """Light on the sensor at `settings`, (4, H, W), without noise or clipping, times `gain`."""
+        """Light on the sensor at `settings`, (4, H, W), without noise or clipping, times `gain`.
+
+        `gain` is a finite number >= 0.
+        """
+        check_number("gain", gain, 0.0, sys.float_info.max)
         known = self._transition(settings, noise=False, gain=np.array([gain]))
         return (known.light[0] * known.table[0, 0, 0].item()).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
@@ -211,14 +217,15 @@ class PreparedScene:
             (4, H, W) float32 in [-pedestal, 1], and its excess noise (see `SimulationPlan`).
         """
         check_type("settings", settings, CameraSettings)
-        (frame,) = self.expose([settings], seed=seed, noise=noise)
-        if self.nlf.is_zero:
-            return frame, 0.0
-        known = self._transition(settings)
+        check_word("noise", noise, get_args(Noise))
+        frames = self._frames(1, None)
+        known = self._record([settings], frames, seed, noise)
+        if known is None or self.nlf.is_zero:
+            return frames[0], 0.0
         shares = known.remaining_variance or [None]
         targets = noise_columns(self.camera, [settings], self.box_factor)
         excess, _ = noise_balances([known.light[0]], shares, known.table, targets)
-        return frame, excess.item()
+        return frames[0], excess.item()
 
     def expose(
         self,
@@ -247,12 +254,25 @@ class PreparedScene:
         _check_light("gain", gain, (len(states),))
         _check_light("row_gain", row_gain, (len(states), self.light.shape[-2]))
         frames = self._frames(len(states), out)
+        self._record(states, frames, seed, noise, gain, row_gain)
+        return frames
+
+    def _record(
+        self,
+        states: Sequence[CameraSettings],
+        frames: torch.Tensor,
+        seed: int,
+        noise: Noise | None,
+        gain: np.ndarray | None = None,
+        row_gain: np.ndarray | None = None,
+    ) -> Transitions | None:
+        """Records captures to `frames`; returns what the last part of them was made of."""
         keys = sweep_keys(seed, states)  # a bad seed raises before any work
         read_noise: ReadNoises | None = None
         if noise == "sensor":
-            read_noise = ReadNoises.of(
-                [self.camera.read_noise(s.iso, self.box_factor) for s in states]
-            )
+            each = [self.camera.read_noise(s.iso, self.box_factor) for s in states]
+            read_noise = ReadNoises.of(each)
+        transitions = None
         for some, transitions in self.transitions(states, noise=noise is not None, gain=gain):
             record(
                 transitions,
@@ -263,7 +283,7 @@ class PreparedScene:
                 row_gain=None if row_gain is None else row_gain[some],
                 signals=frames[some],
             )
-        return frames
+        return transitions
 
     def transitions(
         self,

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.ndimage import correlate
 
-from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import batch as batch_module
 from simulator.capture import blurred_frames
 from simulator.capture.batch import MODULES, CaptureBatch
@@ -315,6 +315,10 @@ def alone(scene, state, gain, key, noise="bank"):
     if key is None:  # the light has no pattern of the sensor
         scene = scene.changed(camera=Z6)
     ((_, found),) = scene.transitions(states, gain=np.array([gain]))
+    nlf, ratio = Z6.nlf(states[0].iso), gain * exposure_ratio(REFERENCE, states[0])
+    np.testing.assert_allclose(found.table[0, 0], ratio, rtol=1e-6)
+    noises, atol = found.table[0, 1:3] + found.table[0, 3:], 1e-6 * found.table[0, 3:].max()
+    np.testing.assert_allclose(noises, [nlf.shot, nlf.read], 1e-6, atol)
     shares = found.remaining_variance or [None]
     fixed = shares, found.table, noise_columns(Z6, states, 1)
     excess, _ = noise_balances([found.light[0]], *fixed)
@@ -430,3 +434,22 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
     for states in (changed, 0):
         expected, _ = photographed(made(noise), states)
         np.testing.assert_array_equal(photographed(batch, states)[0], expected)
+
+
+def test_an_interrupt_while_the_noise_of_averages_is_new(monkeypatch) -> None:
+    def scene(index: int) -> PreparedScene:
+        return replace(prepared(0), box_factor=1 + index % 2)
+
+    expected, _ = photographed(made("exact", scenes=scene), 0)
+    batch, original = made("exact", scenes=scene), batch_module.columns.noise_columns
+
+    def fail(camera, states, box):
+        if box == 2:
+            raise KeyboardInterrupt
+        return original(camera, states, box)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch_module.columns, "noise_columns", fail)
+        with pytest.raises(KeyboardInterrupt):
+            photographed(batch, 0)
+    np.testing.assert_array_equal(photographed(batch, 0)[0], expected)

@@ -246,7 +246,8 @@ def test_bad_scenes_and_sweeps_are_refused():
     scenes |= {"layout": [Layout(torch.zeros(8, 8))], "image_speed": [-1.0, 1000.1]}
     scenes |= {"tolerance": [math.inf], "defocus": [math.nan, 513.0]}
     scenes |= {"gain": [-1.0, "1", None, math.inf, math.nan]}
-    scenes |= {"denoised_lights": [(DenoisedLight(torch.zeros(4, 8, 8)),)]}
+    four = (DenoisedLight(flat(0.2)),) * 4
+    scenes |= {"denoised_lights": [(DenoisedLight(torch.zeros(4, 8, 8)),), four, torch.zeros(4)]}
     outs = [torch.empty(2, 4, SIDE, SIDE), torch.empty(1, 4, SIDE, SIDE, dtype=torch.float64)]
     outs += [torch.empty(1, 4, SIDE, 2 * SIDE)[..., ::2]]
     outs += [torch.empty(1, 4, SIDE, SIDE, requires_grad=True)]
@@ -297,6 +298,19 @@ def test_averages_and_windows() -> None:
     assert Layout(torch.zeros(2, 4), halves).averaged(2).subject.tolist() == [[False, True]]
     for everywhere in (False, True):  # nothing and everything are no subject
         assert Layout(torch.zeros(4, 4), torch.full((4, 4), everywhere)).subject is None
+
+
+@pytest.mark.parametrize("name", ["plan", "capture", "expected", "output_noise"])
+def test_one_capture_names_what_is_wrong(name: str) -> None:
+    call = getattr(prepared(), name)
+    wrong = {"plan": {"noise": ["exact", None, 1]}, "capture": {"noise": [None, "none"]}}
+    wrong |= {"expected": {"gain": ["2", None, -1.0, math.nan, np.ones(1)]}}
+    for argument, values in wrong.get(name, {}).items():
+        for value in values:
+            with pytest.raises(ValueError, match=f"`{argument}`"):
+                call(LOW, **{argument: value})
+    with pytest.raises(ValueError, match="`settings`"):
+        call("x")
 
 
 def test_errors_name_the_argument() -> None:
