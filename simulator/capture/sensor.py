@@ -109,16 +109,13 @@ def pixel_response(camera: CameraProfile, shape: tuple[int, ...], box_factor: in
 # -- a batch of frames ------------------------------------------------------------------------
 
 
-Lights = Sequence[torch.Tensor] | torch.Tensor
-
-
 @dataclass
 class Transitions:
     """All that B frames depend on, except for their noise."""
 
     #: (4, H, W) each, contiguous float32: blurred already, at the exposure of its prepared scene.
     #: Several may be the same. One tensor (B, 4, H, W) where torch is to record the frames.
-    light: Lights
+    light: Sequence[torch.Tensor] | torch.Tensor
     #: (B, 5, 4) float32, columns are the planes R, G1, G2, B. The rows: exposure ratio; shot and
     #: read noise that is missing, negative where the source has more; shot and read noise of the
     #: source on the target's scale.
@@ -272,7 +269,11 @@ def _record_stepwise(
         part = slice(first, first + together)
         light = lights[part] if isinstance(lights, torch.Tensor) else lights[first][None]
         table = torch.from_numpy(transitions.table[part]).to(device)[..., None, None]
-        share = None if keys is None else _stacked(shares[part], light)
+        share = None
+        if keys is not None and any(left is not None for left in shares[part]):
+            all_left = light.new_ones(light.shape[-2:])
+            each = [all_left if left is None else left.to(device) for left in shares[part]]
+            share = torch.stack(each)[:, None]  # (B, 1, H, W)
         if row_gain is not None:
             gains = torch.from_numpy(row_gain[part]).to(light)[:, None, :, None]
             light = light * gains
@@ -301,15 +302,6 @@ def _record_stepwise(
             for name in shown:
                 outputs[name][part] = signals.clamp(float(LEAST_SIGNALS[name]), 1.0)
     return counts
-
-
-def _stacked(shares: Sequence[torch.Tensor | None], like: torch.Tensor) -> torch.Tensor | None:
-    """Remaining shares of a batch's variances as (B, 1, H, W), like the signals; None for all."""
-    if all(share is None for share in shares):
-        return None
-    everything = like.new_ones(like.shape[-2:])
-    each = [everything if share is None else share.to(like.device) for share in shares]
-    return torch.stack(each)[:, None]
 
 
 def _read_part(
