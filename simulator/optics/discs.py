@@ -21,13 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from simulator.optics.motion import (
-    Taps,
-    grid_taps,
-    has_kernels,
-    path_blur,
-    streak,
-)
+from simulator.optics.motion import Taps, grid_taps, has_kernels, path_blur, streak
 from simulator.raw.image import new_frame
 from simulator.utils.checks import check_number
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
