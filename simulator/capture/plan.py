@@ -207,8 +207,7 @@ class SimulationPlan:
             lines.append(f"the ISO is {stops} beyond the noise calibration")
         return "\n".join(lines)
 
-    def __str__(self) -> str:
-        return self.explain()
+    __str__ = explain
 
 
 def _short(number: float) -> str:
@@ -253,16 +252,16 @@ def plan_capture(
     operations = {name: each * samples for name, each in _OPERATIONS.items()}
     operations["defocus"] = 2 * (1 + int(planned.blurs["defocus_px"].item()) ** 2) * samples
     operations["noise_reduction"] = 0 if denoised is None else denoised.operations
-    decided = [*_blurs_and_noise(scene, settings.effective_f_number, planned, noise)]
-    decided += _products(scene, settings.effective_f_number, noise)
-    reason = "no pixel lacks noise: the source has the target's already, or more"
-    reasons = ("" if lacks else reason, "") if noise else (_NOT_WANTED, _NOT_WANTED)
-    decided.append(("noise", noise and lacks, reasons[0], 0.0))
-    decided.append(("clip_and_quantise", noise, reasons[1], 0.0))
-    steps = [Step("exposure", True, "", 0.0, operations["exposure"])]
-    for name, runs, reason, error in decided:
-        cost = (0.0, operations[name]) if runs else (error, 0)
-        steps.append(Step(name, runs, reason, *cost))
+    unwanted = "" if noise else _NOT_WANTED
+    enough = "" if lacks else "no pixel lacks noise: the source has the target's already, or more"
+    steps = [
+        Step("exposure", True, ""),
+        *_blurs_and_noise(scene, settings.effective_f_number, planned, noise),
+        *_products(scene, settings.effective_f_number, noise),
+        Step("noise", noise and lacks, unwanted or enough),
+        Step("clip_and_quantise", noise, unwanted),
+    ]
+    steps = [s._replace(operations=operations[s.name]) if s.runs else s for s in steps]
     (nlf,) = scene.camera.nlfs([settings])
     return SimulationPlan(
         settings=settings,
@@ -278,13 +277,9 @@ def plan_capture(
     )
 
 
-#: A step, whether it runs, why, and the error of leaving it out.
-_Decided = tuple[str, bool, str, float]
-
-
 def _blurs_and_noise(
     scene: PreparedScene, f_number: float, planned: Planned, noise: bool
-) -> Iterator[_Decided]:
+) -> Iterator[Step]:
     """The steps that `plan_frames` decides on."""
     ((denoised, opened_to),), (blur,), (found,) = planned.origins, planned.blurs, planned.details
     opens = blur["defocus_px"] > 0.0, blur["motion_px"] > 0.0
@@ -301,7 +296,8 @@ def _blurs_and_noise(
             reasons.append(_BLUR_REASONS[name][not ran].format(extent=extent))
     for name, ran, reason, error in zip(STEPS, runs, reasons, found.tolist(), strict=False):
         without = f"; leaving it out would be an error of {error:.2g}"
-        yield name, ran, reason + without * (ran and error < math.inf), error
+        reason += without * (ran and error < math.inf)
+        yield Step(name, ran, reason, 0.0 if ran else error)
 
 
 def _reason_of_noise(
@@ -326,7 +322,7 @@ def _reason_of_noise(
     return "the source's noise beyond the target's is within the tolerance"
 
 
-def _products(scene: PreparedScene, f_number: float, noise: bool) -> Iterator[_Decided]:
+def _products(scene: PreparedScene, f_number: float, noise: bool) -> Iterator[Step]:
     """Vignetting and pixel response, where there are any: too cheap to weigh their errors."""
     lens, prnu = scene.lens, scene.camera.prnu
     if lens is not None:
@@ -337,14 +333,14 @@ def _products(scene: PreparedScene, f_number: float, noise: bool) -> Iterator[_D
             if scene.seen_through_lens:
                 source = lens.corner_loss(scene.reference.effective_f_number)
                 reason += f", {source:.2g} in the source"
-        yield "vignetting", runs, reason, 0.0
+        yield Step("vignetting", runs, reason)
     if prnu:
         reason = f"the gains of photosites differ by {prnu:.2%}"
         if not noise:
             reason = _NOT_WANTED
         elif not scene.nlf.is_zero:
             reason = "the source has the pattern of its own sensor"
-        yield "pixel_response", noise and scene.nlf.is_zero, reason, 0.0
+        yield Step("pixel_response", noise and scene.nlf.is_zero, reason)
 
 
 def _predict_errors(
