@@ -176,24 +176,19 @@ def scene_column(scene: PreparedScene, targets: int, rest: int) -> tuple[Any, ..
         *(scene.reference.log2_exposure, scene.gain, scene.tolerance),
         *(scene.defocus, scene.image_speed, movement.direction, movement.turn),
         *(movement.subject_speed, movement.subject_direction, targets, rest),
-        *layout_column(scene.layout, subject=True),
+        *layout_column(scene.layout),
     )
 
 
 def vignetting_column(scene: PreparedScene, states: Sequence[CameraSettings]) -> np.ndarray:
     """(S,) uintp addresses of the vignetting of captures, 0 for none; the lens keeps its maps."""
-    if scene.lens is None:
-        return np.zeros(len(states), np.uintp)
-    return np.array([_address(scene.vignetting(s.effective_f_number)) for s in states], np.uintp)
+    maps = [scene.vignetting(s.effective_f_number) for s in states]
+    return np.array([0 if gains is None else gains.ctypes.data for gains in maps], np.uintp)
 
 
-def _address(array: np.ndarray | None) -> int:
-    return 0 if array is None else array.ctypes.data
-
-
-def layout_column(layout: Layout | None, subject: bool) -> tuple[int, ...]:
-    """The `LAYOUT` of a layout, 0 where there is none, or none of its `subject`."""
-    arrays = () if layout is None else layout.arrays[: 4 if subject else 2]
+def layout_column(layout: Layout | None) -> tuple[int, ...]:
+    """The `LAYOUT` of a layout, 0 where there is none, or no subject."""
+    arrays = () if layout is None else layout.arrays
     found = [array.__array_interface__["data"][0] for array in arrays] + [0] * (4 - len(arrays))
     return (*found[:2], arrays[1].size if arrays else 0, *found[2:])
 
@@ -336,20 +331,12 @@ def _weigh_noise(noise, state, wanted, opens, errors):  # type: ignore[no-untype
     errors[_ROUNDING] = ROUNDING * relative_level(bins[0], bins[3], ratio, target)
     if own.f_number != 0.0 and own.f_number != state.f_number:
         change = blur_change(bins[0], bins[3], disc, ratio, own.source, target, wanted)
-        errors[_DEPTH] = _map_error(change, own.f_number / state.f_number, own.mean_square)
+        wide = own.f_number / state.f_number
+        if wide <= 1.0:  # what a smaller aperture would sharpen stays blurred
+            errors[_DEPTH] = KEPT_BLUR_ERROR * change * own.mean_square * (1.0 - wide * wide)
+        else:
+            errors[_DEPTH] = change * MISSED_BLUR**2 * (wide * wide - 1.0)
     return network, error if own.networks > 0 and error <= tolerance else 0.0
-
-
-@kernel()
-def _map_error(disc, wide, mean_square):  # type: ignore[no-untyped-def]
-    """Error of a map of defocus where the aperture is so many times as `wide` as the source's.
-
-    `disc` is the `blur_change`; the `mean_square` of the map's diameters counts at smaller
-    apertures only: what they would sharpen stays blurred.
-    """
-    if wide <= 1.0:
-        return KEPT_BLUR_ERROR * disc * mean_square * (1.0 - wide * wide)
-    return disc * MISSED_BLUR**2 * (wide * wide - 1.0)
 
 
 @kernel()
