@@ -55,7 +55,7 @@ NOISE = np.dtype(
     [
         ("source", "f8", (2, 4)),  # shot and read noise
         ("clipped", "f8", 2),  # `PreparedScene.clipped_light`
-        ("bins", "f8", (4, 4, BINS)),  # `LightStatistics.noise_columns`
+        ("bins", "f8", (4, 4, BINS)),  # `LightStatistics.bins` without differences
         # Of the networks: `LightStatistics.columns` of what they have denoised, and
         # `ResidualStatistics.columns`, 0 where the error was not measured.
         ("denoised", "f8", (NETWORKS, 4, 4, BINS)),
@@ -141,7 +141,7 @@ def noise_column(scene: PreparedScene, states: np.ndarray, *, errors: bool) -> n
     """
     found, blur = np.zeros((), NOISE), scene.aperture_blur
     found["source"], found["known"] = (scene.nlf.shot, scene.nlf.read), True
-    found["bins"] = scene.statistics.noise_columns
+    found["bins"] = scene.statistics.bins[:4]
     if not scene.nlf.is_zero:
         found["noisy"], found["networks"] = True, len(scene.denoised_lights)
         found["needs_network"] = blur is not None and blur.needs_denoised

@@ -17,7 +17,7 @@ from simulator.camera import get_camera
 from simulator.capture.columns import ERRORS, STEPS, Planned, noise_columns, plan_captures
 from simulator.capture.limits import SIGNAL_LIMIT
 from simulator.capture.sensor import Transitions, record
-from simulator.capture.statistics import SUMS, DenoisedLight, network_error, noise_numbers
+from simulator.capture.statistics import SUMS, DenoisedLight, network_error
 from simulator.noise.noise_level_function import VARIANCE_LIMIT
 from simulator.settings import CameraSettings
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
@@ -356,8 +356,8 @@ def _predict_errors(
         errors["unknown depth"] = math.hypot(errors["unknown depth"], opening)
     if denoised is not None and denoised.rounding is not None:
         columns = scene.blurred_light.residuals.columns(denoised.rounding)
-        noises = noise_numbers(scene.nlf), targets[0]
-        bfloat16 = network_error(*columns, ratios.item(), *noises, noise)
+        source = np.array([scene.nlf.shot, scene.nlf.read])
+        bfloat16 = network_error(*columns, ratios.item(), source, targets[0], noise)
         errors["rounding"] = math.hypot(errors["rounding"], bfloat16)
     return errors
 

@@ -236,15 +236,10 @@ class LightStatistics:
     def columns(self) -> np.ndarray:
         """(4, P, B): share, light, and squared second differences of bins, for `curvature`."""
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
-        return self._bins[[0, 1, 4, 5]]
-
-    @property
-    def noise_columns(self) -> np.ndarray:
-        """(4, P, B): share, least, most and mean light of bins, for errors of a source's noise."""
-        return self._bins[:4]
+        return self.bins[[0, 1, 4, 5]]
 
     @functools.cached_property
-    def _bins(self) -> np.ndarray:
+    def bins(self) -> np.ndarray:
         """(6, P, B): share, least, most and mean light, and squared second differences of bins."""
         light, (height, width) = self.light.cpu().numpy(), self.light.shape[-2:]
         # Whole rows: every column counts alike whatever the width, and a row is read at once.
@@ -266,12 +261,6 @@ class LightStatistics:
         found[3:] /= np.maximum(found[0], 1.0)
         found[0] /= 4.0 * samples
         return found
-
-
-@functools.lru_cache(maxsize=256)
-def noise_numbers(nlf: NoiseLevelFunction) -> np.ndarray:
-    """(2, 4) shot and read noise of the planes."""
-    return np.array([nlf.shot, nlf.read])
 
 
 # -- errors of networks -----------------------------------------------------------------------
@@ -395,7 +384,7 @@ class ResidualStatistics:
         Without `noise` the light alone is wanted, in which noise that is left is an error in full;
         the other arguments are those of `LightStatistics`.
         """
-        noises = noise_numbers(self.nlf), noise_numbers(target)
+        noises = (np.array([nlf.shot, nlf.read]) for nlf in (self.nlf, target))
         return float(network_error(*self.columns(residual), float(ratio), *noises, noise))
 
     def columns(self, residual: Residual) -> np.ndarray:

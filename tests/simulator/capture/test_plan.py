@@ -124,12 +124,12 @@ class Statistics(LightStatistics):
     makes `noise` be the error. A disc moves a pixel by a 32nd of the Laplacian, a streak by a 24th.
     """
 
-    columns = noise_columns = np.empty(0)
+    columns = bins = np.empty(0)
 
     def __init__(self, noise: float = 0.0, disc: float = 0.0, streak: float = 0.0) -> None:
-        self.columns, self.noise_columns = np.zeros((2, 4, 4, statistics.BINS))
+        self.columns, self.bins = np.zeros((2, 4, 4, statistics.BINS))
         self.columns[:, :, 0] = [[0.25], [0.0], [(32.0 * disc) ** 2], [(24.0 * streak) ** 2]]
-        self.noise_columns[:, :, 0] = [[0.25], *[[(1.0 + noise) ** 2]] * 2, [noise**2]]
+        self.bins[:, :, 0] = [[0.25], *[[(1.0 + noise) ** 2]] * 2, [noise**2]]
 
 
 #: A flat field of unit noise: a network's error there is that of its first knot.

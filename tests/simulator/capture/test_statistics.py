@@ -21,6 +21,11 @@ def nlf(shot: float, read: float) -> NoiseLevelFunction:
     return NoiseLevelFunction((shot,) * 4, (read,) * 4)
 
 
+def numbers(noise: NoiseLevelFunction) -> np.ndarray:
+    """(2, 4) shot and read noise."""
+    return np.array([noise.shot, noise.read])
+
+
 def natural(height: int = 96, width: int = 128, seed: int = 0) -> np.ndarray:
     """Light with the 1 / f spectrum of photographs, log-normal over three stops, (4, H, W)."""
     rng = np.random.default_rng(seed)
@@ -69,15 +74,15 @@ def variance(signal: np.ndarray, iso: float) -> np.ndarray:
 
 def blur_error(statistics, ratio, target, streak=0.0, disc=0.0):
     """Bound on the error of leaving out a blur of these extents [pixel]."""
-    noises = module.noise_numbers(target)
+    noises = numbers(target)
     per_disc, per_streak = module.curvature(statistics.columns, ratio, noises)
     return per_disc * disc**2 + per_streak * streak**2
 
 
 def excess_error(statistics, ratio, *noises):
     """Of leaving the noise of a source, where that of a target is wanted."""
-    bins = statistics.noise_columns
-    return module.excess_error(bins[0], bins[1:3], ratio, *map(module.noise_numbers, noises))
+    bins = statistics.bins
+    return module.excess_error(bins[0], bins[1:3], ratio, *map(numbers, noises))
 
 
 def tensor(light: np.ndarray) -> torch.Tensor:
@@ -122,11 +127,11 @@ def test_levels_in_units_of_the_noise() -> None:
     statistics = LightStatistics(tensor(light))
     zero = np.zeros_like(light)
     expected = exact(light, 3.0, 3.0 * light, zero, 400)
-    bins, target = statistics.noise_columns, module.noise_numbers(Z6.nlf(400))
+    bins, target = statistics.bins, numbers(Z6.nlf(400))
     level = module.relative_level(bins[0], bins[3], 3.0, target)
     assert level == pytest.approx(expected, rel=0.01)
     expected = exact(light, 3.0, zero, 3.0 * np.sqrt(variance(light, 1600)), 400)
-    exposed = module.noise_numbers(Z6.nlf(1600).exposed(3.0))
+    exposed = numbers(Z6.nlf(1600).exposed(3.0))
     found = math.sqrt(module.variance_beyond(bins[0], bins[3], 3.0, exposed, target, 0.0))
     assert found == pytest.approx(expected, rel=0.01)
     assert excess_error(statistics, 1.0, Z6.nlf(100), ZERO) > 1e6  # without noise all is seen
