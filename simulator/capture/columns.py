@@ -217,6 +217,7 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
     targets, size, bits, tables = camera[1:]
     (indices, rows, gains, wanted), (blurs, table, error, excess, shares, modules) = given, made[:6]
     extents, errors, runs = np.zeros(3), np.empty(len(ERRORS)), np.empty(3, np.bool_)
+    source = np.empty((2, 4))
     for k in range(first, last):
         row, at = rows[k], rows[k] % len(states)
         scene, state, blur = scenes[indices[k]], states[at], blurs[row]
@@ -253,16 +254,21 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
         error[row] = math.sqrt(square)
         if len(made[6]):
             made[6][row, : len(ERRORS)], made[6][row, len(ERRORS) :] = errors, extents
-        _fill_table(ratio, target, table[row])
-        excess[row], shares[row] = 0.0, 0
+        excess[row], shares[row], source[:] = 0.0, 0, 0.0
         if noises is not None and noises[scene.rest].noisy:
             modules[row] += bits[6] - bits[5] + network * bits[0]
             if network == 0:
                 apart = blur.diameter > 0 and (runs[1] or (runs[2] and blur.mask > 0))
                 shares[row] = np.uintp(TO_BE_MADE) if apart or runs[0] else blur.vignetting
                 energy = 1.0 if apart else remaining_energy(blur, size, tables)
-                source = noises[scene.rest], ratio, target, energy
-                excess[row] = _add_source(source, shares[row] > 0, table[row])
+                own = noises[scene.rest]
+                _expose(own.source, ratio, energy, source)
+                excess[row] = _mean_excess(own.bins, ratio, source, target, shares[row] > 0)
+        for plane in range(4):
+            table[row, 0, plane] = ratio
+            for kind in range(2):
+                table[row, 1 + kind, plane] = target[kind, plane] - source[kind, plane]
+                table[row, 3 + kind, plane] = source[kind, plane]
         if network < 0:
             modules[row] = network
 
@@ -382,31 +388,15 @@ def remaining_energy(blur, size, tables):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _fill_table(ratio, target, table):  # type: ignore[no-untyped-def]
-    """The `table` (5, 4) of a clean source."""
-    for plane in range(4):
-        table[0, plane] = ratio
-        table[1, plane], table[2, plane] = target[0, plane], target[1, plane]
-        table[3, plane] = table[4, plane] = 0.0
-
-
-@kernel()
-def _add_source(noise, differs, table):  # type: ignore[no-untyped-def]
-    """Completes the `table` (5, 4) with a source's noise.
-
-    Returns the excess variance; NaN where that `differs` between pixels.
-    """
-    own, ratio, target, energy = noise
-    source, exceeds = np.empty((2, 4)), False
-    _expose(own.source, ratio, energy, source)
+def _mean_excess(bins, ratio, source, target, differs):  # type: ignore[no-untyped-def]
+    """The excess variance of exposed noise of a `source`; NaN where it `differs` between pixels."""
+    exceeds = False
     for kind in range(2):
         for plane in range(4):
             exceeds |= source[kind, plane] > target[kind, plane]
-            table[1 + kind, plane] = target[kind, plane] - source[kind, plane]
-            table[3 + kind, plane] = source[kind, plane]
     if not exceeds:
         return 0.0
-    excess = variance_beyond(own.bins[0], own.bins[3], ratio, source, target, 1.0)
+    excess = variance_beyond(bins[0], bins[3], ratio, source, target, 1.0)
     return math.nan if differs and excess > 0.0 else excess
 
 
