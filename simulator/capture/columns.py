@@ -50,7 +50,7 @@ SCENE = np.dtype(
 )
 #: Networks of a scene, at most.
 NETWORKS = 3
-#: The noise of a light, and what errors depend on that it makes; see `PreparedScene`.
+#: The noise of a light, and all that the errors depend on which it makes; see `PreparedScene`.
 NOISE = np.dtype(
     [
         ("source", "f8", (2, 4)),  # shot and read noise
@@ -140,11 +140,12 @@ def noise_column(scene: PreparedScene, states: np.ndarray, *, errors: bool) -> n
     `add_networks` adds to it. Without `errors`, what does not decide on steps is left out.
     """
     found, blur = np.zeros((), NOISE), scene.aperture_blur
-    found["source"], found["known"] = (scene.nlf.shot, scene.nlf.read), True
-    found["bins"] = scene.statistics.bins[:4]
+    found["source"] = scene.nlf.shot, scene.nlf.read
     if not scene.nlf.is_zero:
         found["noisy"], found["networks"] = True, len(scene.denoised_lights)
         found["needs_network"] = blur is not None and blur.needs_denoised
+    if errors or found["networks"]:  # else nothing is decided by it
+        found["known"], found["bins"] = True, scene.statistics.bins[:4]
     if errors:
         found["clipped"] = scene.clipped_light
     if errors and blur is not None:
@@ -201,7 +202,7 @@ def plan_frames(first, last, known, noises, camera, given, made):  # type: ignor
         first, last: Frames to plan.
         known: `SCENE` of all scenes; of those at rest `LightStatistics.columns`,
             `vignetting_column` and `opening_column`.
-        noises: `NOISE` of scenes at rest; None where none has any.
+        noises: `NOISE` of scenes at rest; None where none has any, and no errors are asked for.
         camera: `STATE`, (T, S, 2, 4) shot and read noise of its captures, height and width of the
             frames [pixel], (7,) what each of `STEPS` that runs adds to the modules, and what is
             always added for clean and for noisy light, and the tables of `remaining_energy`.
@@ -307,9 +308,9 @@ def _weigh_noise(noise, state, wanted, opens, errors):  # type: ignore[no-untype
     It is the cheapest within the tolerance, or else the one with the least error; where the
     aperture `opens` and its blur works on no other light, always the last. Also the error that
     counts where blurs are weighed. Fills in the `errors` that noise makes, and those of what is not
-    known.
+    known. `noise` has the `NOISE` of a scene and, last, the Laplacians of `LightStatistics.columns`.
     """
-    own, ratio, target, tolerance, disc = noise
+    own, ratio, target, tolerance, laplacians = noise
     bins, network, error = own.bins, 0, math.inf
     if wanted:
         left = excess_error(bins[0], bins[1:3], ratio, own.source, target)
@@ -336,7 +337,7 @@ def _weigh_noise(noise, state, wanted, opens, errors):  # type: ignore[no-untype
     errors[_ISO] = wanted * state.extrapolation_error
     errors[_ROUNDING] = ROUNDING * relative_level(bins[0], bins[3], ratio, target)
     if own.f_number != 0.0 and own.f_number != state.f_number:
-        change = blur_change(bins[0], bins[3], disc, ratio, own.source, target, wanted)
+        change = blur_change(bins[0], bins[3], laplacians, ratio, own.source, target, wanted)
         wide = own.f_number / state.f_number
         if wide <= 1.0:  # what a smaller aperture would sharpen stays blurred
             errors[_DEPTH] = KEPT_BLUR_ERROR * change * own.mean_square * (1.0 - wide * wide)
@@ -439,8 +440,8 @@ def plan_captures(
 ) -> Planned:
     """Captures of a scene at S states, in light (S,) relative to its own, or without `noise`.
 
-    Without `errors`, those of what is not known are 0, and errors of noise where there is none to
-    decide on. A `ValueError` where a disc is too wide.
+    Without `errors`, only those that decide on steps are worked out, the others are 0. A
+    `ValueError` where a disc is too wide.
     """
     columns, count, rows = state_columns(scene.camera, states), len(states), np.arange(len(states))
     check_disc(scene.defocus, columns["f_number"].min().item(), scene.light.shape)
@@ -454,7 +455,7 @@ def plan_captures(
     targets = noise_columns(scene.camera, states, scene.box_factor)[None]
     bits = np.array([1, NETWORKS + 1, 0, 0, 0, 0, 0])  # of noise reduction and aperture alone
     camera = columns, targets, tuple(scene.light.shape[-2:]), bits, blur_tables()
-    given = 0 * rows, rows, np.ones(count) if gains is None else gains.astype(float), noise
+    given = 0 * rows, rows, np.ones(count) if gains is None else gains.astype(float), bool(noise)
     plan_frames(0, count, known, noises, camera, given, (*made, details))
     while (modules < 0).any():
         assert noises is not None

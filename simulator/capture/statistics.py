@@ -241,7 +241,7 @@ class LightStatistics:
     @functools.cached_property
     def bins(self) -> np.ndarray:
         """(6, P, B): share, least, most and mean light, and squared second differences of bins."""
-        light, (height, width) = self.light.cpu().numpy(), self.light.shape[-2:]
+        light, (height, width) = self.light.detach().cpu().numpy(), self.light.shape[-2:]
         # Whole rows: every column counts alike whatever the width, and a row is read at once.
         step = math.ceil(height * width / SAMPLES)
         rows = np.arange(min(step, height) // 2, height, step)
