@@ -323,8 +323,9 @@ class CaptureBatch:
                 self._add_alone(index)
             inside = rest >= 0
             new, rest = indices[inside], rest[inside]
-            widest = moves["defocus"][inside].max(initial=0.0).item()
-            columns.check_disc(widest, self._apertures[0].item(), self._size)
+            if len(new):
+                widest = moves["defocus"][inside].max().item()
+                columns.check_disc(widest, self._apertures[0].item(), self._size)
             self._scene_columns[new] = self._scene_columns[rest]
             for name in columns.MOVES.names or ():
                 self._scene_columns[name][new] = moves[name][inside]

@@ -308,7 +308,7 @@ def _weigh_noise(noise, state, wanted, opens, errors):  # type: ignore[no-untype
     It is the cheapest within the tolerance, or else the one with the least error; where the
     aperture `opens` and its blur works on no other light, always the last. Also the error that
     counts where blurs are weighed. Fills in the `errors` that noise makes, and those of what is not
-    known. `noise` has the `NOISE` of a scene and, last, the Laplacians of `LightStatistics.columns`.
+    known. `noise` ends with the Laplacians of `LightStatistics.columns`.
     """
     own, ratio, target, tolerance, laplacians = noise
     bins, network, error = own.bins, 0, math.inf
