@@ -235,12 +235,49 @@ def record(
         raise ValueError(f"`outputs` (={sorted(unknown)}) must be of {', '.join(_KINDS)}")
     if len(transitions.light) == 0:
         return np.zeros((0, 2), np.int64)
-    noises = keys, noise, read_noise
     if transitions.needs_torch:
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
+        noises = keys, noise, read_noise
         return _record_stepwise(transitions, camera, noises, row_gain, tensors, count)
+    light, remaining, read = transitions.light, transitions.remaining_variance, None
+    frames, samples = len(light), math.prod(transitions.shape[1:])
+    pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
+    counts = np.empty((frames * 4 * pieces if count else 0, 2), np.int64)
+    shares = np.zeros(frames, np.uintp) if remaining is None else addresses(remaining)
+    drawn = None if keys is None or noise == "bank" else True
+    if keys is not None and read_noise is not None:
+        of_rows, of_pixels = (noise_keys(keys, number) for number in (1, 2))
+        tables = tail_tables(read_noise.kinds)
+        read = of_rows, of_pixels, transitions.shape[2], read_noise.which, *tables
     arrays = {name: np.asarray(out) for name, out in outputs.items()}
-    return _record_fused(transitions, camera, noises, row_gain, arrays, count, means, run)
+    codes, numbers, *signals = (
+        arrays[name].reshape(frames, 4, samples) if name in arrays else np.empty((0, 4, 0), dtype)
+        for name, dtype in _KINDS.items()
+    )
+    fixed = (
+        samples,
+        (addresses(light), shares, transitions.table),
+        (_NO_KEYS, _NO_BANK) if keys is None else (keys, _NO_BANK if drawn else noise_bank()),
+        camera.digits,
+        (codes, numbers, tuple(signals), counts),
+    )
+    # Means come with the frames where none of these is to be divided.
+    least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
+    size = 4 * pieces if least >= 4 * pieces or frames >= 2 * torch.get_num_threads() else 1
+    gains = None if row_gain is None else row_gain.astype(np.float32)
+    filled = tuple(_NO_MEANS if means is None or size == 1 else means)
+    whole = *fixed, filled, drawn, read, gains
+    if run is None:
+        parallel_ranges(
+            lambda first, last: record_units(first * size, last * size, *whole),
+            frames * 4 * pieces // size,
+            least=max(1, least // size),
+        )
+    else:
+        run(4 * pieces, whole)
+    if means is not None and size == 1:
+        means.fill(codes)
+    return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -478,7 +515,7 @@ def _digitise_with_rows(  # type: ignore[no-untyped-def]
 def _draw_tails(read, frame, block, words, out):  # type: ignore[no-untyped-def]
     """`tukey_lambda` of a block of normals; returns its row of the parts of `tail_tables`.
 
-    See `_record_fused` for `read`.
+    See `record` for `read`.
     """
     _, keys, _, which, parts, tables = read
     kind = which[frame]
@@ -652,56 +689,3 @@ def is_compiled() -> bool:
     """Whether the kernel that records frames was compiled before, on this machine."""
     file = getattr(getattr(record_units, "_cache", None), "_cache_file", None)
     return file is None or bool(file._load_index())  # without a cache a second process is no use
-
-
-def _record_fused(
-    transitions: Transitions,
-    camera: CameraProfile,
-    noises: tuple[np.ndarray | None, Noise, ReadNoises | None],
-    row_gain: np.ndarray | None,
-    given: Mapping[str, np.ndarray],
-    count: bool,
-    means: CodeMeans | None,
-    run: Callable[[int, tuple[Any, ...]], None] | None,
-) -> np.ndarray:
-    """`record` on the CPU; see `_record_stepwise` for the `noises`."""
-    (keys, noise, read_noise), read = noises, None
-    light, remaining = transitions.light, transitions.remaining_variance
-    frames, samples = len(light), math.prod(transitions.shape[1:])
-    pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
-    units = frames * 4 * pieces
-    counts = np.empty((units if count else 0, 2), np.int64)
-    shares = np.zeros(frames, np.uintp) if remaining is None else addresses(remaining)
-    drawn = None if keys is None or noise == "bank" else True
-    if keys is not None and read_noise is not None:
-        of_rows, of_pixels = (noise_keys(keys, number) for number in (1, 2))
-        tables = tail_tables(read_noise.kinds)
-        read = of_rows, of_pixels, transitions.shape[2], read_noise.which, *tables
-    codes, numbers, *signals = (
-        given[name].reshape(frames, 4, samples) if name in given else np.empty((0, 4, 0), dtype)
-        for name, dtype in _KINDS.items()
-    )
-    fixed = (
-        samples,
-        (addresses(light), shares, transitions.table),
-        (_NO_KEYS, _NO_BANK) if keys is None else (keys, _NO_BANK if drawn else noise_bank()),
-        camera.digits,
-        (codes, numbers, tuple(signals), counts),
-    )
-    # Means come with the frames where none of these is to be divided.
-    least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
-    size = 4 * pieces if least >= 4 * pieces or frames >= 2 * torch.get_num_threads() else 1
-    gains = None if row_gain is None else row_gain.astype(np.float32)
-    filled = tuple(_NO_MEANS if means is None or size == 1 else means)
-    whole = *fixed, filled, drawn, read, gains
-    if run is None:
-        parallel_ranges(
-            lambda first, last: record_units(first * size, last * size, *whole),
-            units // size,
-            least=max(1, least // size),
-        )
-    else:
-        run(4 * pieces, whole)
-    if means is not None and size == 1:
-        means.fill(codes)
-    return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)
