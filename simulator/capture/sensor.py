@@ -21,11 +21,9 @@ share their light. The source's own noise is multiplied with its light, its vari
 of the row's gain, r^2. What the top-up takes away for it has the variance times r: exact for shot
 noise, and off by r (1 - r) of the source's read noise.
 
-*The noise of a frame* is a function of its key and of nothing else (`simulator.noise.generator`).
-
-`record` is the one way from light to frames. On the CPU it is one fused kernel, which works in
-blocks of 256 samples that stay in the first-level cache, vectorised by the compiler. Elsewhere the
-steps run one by one.
+`record` is the one way from light to frames: on the CPU one fused kernel, in blocks of 256 samples
+that stay in the first-level cache; elsewhere the steps one by one. The noise of a frame is a
+function of its key alone (`simulator.noise.generator`).
 """
 
 from __future__ import annotations
@@ -173,9 +171,8 @@ class Transitions:
     @property
     def lacks_noise(self) -> bool:
         """Whether any signal could have less noise than its target; else none need be drawn."""
-        if (self.table[:, 1:3] > 0.0).any():
-            return True
-        return any(share is not None for share in self.remaining_variance or ())
+        missing = bool((self.table[:, 1:3] > 0.0).any())
+        return missing or any(share is not None for share in self.remaining_variance or ())
 
 
 def missing_variance(
@@ -573,7 +570,7 @@ def _clips(number, low, high):  # type: ignore[no-untyped-def]
 
 @_jit()
 def _compand(numbers, darkest, scale, low, high, counts, out):  # type: ignore[no-untyped-def]
-    """Codes ``round(255 sqrt((x + p) / (1 + p)))`` of digital numbers, which are counted, too."""
+    """Codes ``round(255 sqrt((x + p) / (1 + p)))`` of digital numbers; counts as `_count` does."""
     for j in range(len(out)):
         x = numbers[j] - darkest
         out[j] = np.uint8(np.int32(np.sqrt(x if x > _ZERO else _ZERO) * scale + _HALF))
