@@ -99,8 +99,8 @@ def main(size=64, num_envs=256):
         moved = traffic.bytes / (STEPS * num_envs)
         print(
             f"{name}: {moved / 1e6:.1f} MB a frame, {traffic.operations / STEPS:,.0f} operations a "
-            f"step of {num_envs}; at {BANDWIDTH / 1e12:g} TB/s {BANDWIDTH / moved:,.0f} frames/s; planned "
-            f"in {planning:.1f} microseconds a frame"
+            f"step of {num_envs}; at {BANDWIDTH / 1e12:g} TB/s {BANDWIDTH / moved:,.0f} frames/s; "
+            f"planned in {planning:.1f} microseconds a frame"
         )
 
 

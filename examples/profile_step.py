@@ -29,7 +29,7 @@ CALLERS = {
     "_plan_rows": "plans of large batches",
     "_photograph": "blur, frames, sums of codes",
     "blur": "sharpness of each capture",
-    "_record_fused": "frames, sums of codes",
+    "record": "frames, sums of codes",
 }
 
 
