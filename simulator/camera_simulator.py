@@ -51,7 +51,7 @@ from simulator.optics.vignetting import Vignetting, get_lens
 from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.utils.checks import check_word
+from simulator.utils.checks import check_type, check_word
 from simulator.utils.compute import check_bfloat16, check_device
 from simulator.utils.tiles import in_tiles, varying
 
@@ -481,6 +481,7 @@ class CameraSimulator:
         """
         noise, aperture = _required("noise", self.noise), _required("aperture", self.aperture)
         check_word("depth", depth, get_args(Depth))
+        check_type("settings", settings, CameraSettings)
         sweep_keys(seed, [settings])  # a bad seed raises before any work
         prepared = self._seen(source, image_speed, defocus, lens)
         # A prepared scene may be corrected already; a scene is no recording of this body.
