@@ -236,8 +236,8 @@ def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Te
     ((_, found),) = prepared.transitions([settings])
     # What is white is white, however bright: its neighbours' noise is pooled with it.
     light = (found.light[0] * found.table[0, 0, 0].item()).clamp_(max=1.0)
-    table, shares = torch.from_numpy(found.table[0, 1:, :, None, None]), found.remaining_variance
-    return light, missing_variance(light, table, shares and shares[0]).clamp(min=0.0)
+    (share,), rows = found.remaining_variance or [None], found.table[0, 1:, :, None, None]
+    return light, missing_variance(light, torch.from_numpy(rows), share).clamp(min=0.0)
 
 
 def distance(light: Tensor, added: Tensor, truth: Tensor, wanted: Tensor, shows: Tensor) -> float:
