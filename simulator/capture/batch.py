@@ -409,11 +409,8 @@ class CaptureBatch:
         modules, rest = self._modules[rows], self._rest[indices]
         for k in np.flatnonzero(self._share[rows] == columns.TO_BE_MADE).tolist():
             row, f_number = rows.item(k), self._columns["f_number"].item(rows[k] % len(self.states))
-            scene, opened_to = (
-                self._scenes[rest.item(k)],
-                f_number if modules[k] & _OPENING else None,
-            )
-            fixed = scene.layout, scene.vignetting(f_number), opened_to
+            scene, opens = self._scenes[rest.item(k)], modules[k] & _OPENING
+            fixed = scene.layout, scene.vignetting(f_number), f_number if opens else None
             found = scene.blurred_light.remaining_variance(self._blur[row], *fixed)
             self._maps[row] = found
             self._share[row] = 0 if found is None else found.data_ptr()

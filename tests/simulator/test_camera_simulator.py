@@ -349,6 +349,18 @@ def test_tolerance_nought_equals_the_full_run(compact, scene, noise):
         assert difference.mean() < 2e-2  # a number that is nearly halfway
 
 
+def test_the_full_run_has_the_pattern_of_the_sensor_once(compact: CameraSimulator) -> None:
+    """Gains that differ by 2 %: those of the capture, unless the source's are in its light."""
+    body = replace(get_camera("nikon_z6"), prnu=0.02, nlf_by_iso={100.0: ZERO}, segments=())
+    settings, light = CameraSettings(100, 1 / 60, 4), torch.full((4, 64, 64), 0.5)
+    for nlf, spread in ((ZERO, 0.02), (NoiseLevelFunction((1e-6,) * 4, (1e-8,) * 4), 0.0)):
+        source = PreparedScene(light, settings, body, nlf)
+        frame = compact.stages(source, settings, depth="far").capture
+        assert float(frame.std() / frame.mean()) == pytest.approx(
+            spread, rel=0.03, abs=4e-3
+        )  # of the network
+
+
 def test_the_gain_of_a_prepared_scene_is_a_part_of_the_exposure(compact: CameraSimulator) -> None:
     prepared = replace(compact.prepare(noisy_raw()), gain=3.0)
     assert torch.equal(compact.stages(prepared, SOURCE).exposed, prepared.light * 3.0)

@@ -453,3 +453,18 @@ def test_an_interrupt_while_the_noise_of_averages_is_new(monkeypatch) -> None:
         with pytest.raises(KeyboardInterrupt):
             photographed(batch, 0)
     np.testing.assert_array_equal(photographed(batch, 0)[0], expected)
+
+
+def test_a_disc_that_is_too_wide_at_any_state_is_refused_at_the_first_frame() -> None:
+    widest = 512.0 * min(state.effective_f_number for state in STATES) / 4.0
+    narrowest = max(range(len(STATES)), key=lambda i: STATES[i].effective_f_number)
+    photographed(made(scenes=lambda index: prepared(0).changed(defocus=widest)), narrowest)
+    with pytest.raises(ValueError, match="`defocus`"):
+        photographed(made(scenes=lambda i: prepared(0).changed(defocus=1.01 * widest)), narrowest)
+
+
+def test_light_that_nothing_moves_is_cached_once_behind_a_lens() -> None:
+    scene = replace(prepared(0), lens=LENS, movement=Movement(0.6, 2.0), image_speed=1e-9)
+    slow, fast = (CameraSettings(100, time, 2.8) for time in (1 / 50, 1 / 100))
+    ((_, found),) = scene.transitions([slow, fast])
+    assert found.light[0] is found.light[1]
