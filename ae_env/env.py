@@ -14,6 +14,7 @@ from ae_env.episodes.core import (
     EpisodeCore,
     FindTransitions,
     FrameBatch,
+    FrameSource,
     Frames,
     MakeTask,
     Task,
@@ -30,7 +31,7 @@ from ae_env.scorers.captures import Captures, ShownScenes
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from ae_env.scorers.terms import CompositeScorer, depends_on
 from simulator.camera import CameraProfile
-from simulator.capture.batch import MODULES, FrameSource
+from simulator.capture.batch import MODULES
 from simulator.capture.sensor import CodeMeans
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.cache import LruCache

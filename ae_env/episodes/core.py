@@ -32,7 +32,7 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import in_episode, prepare_scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.scorers.terms import CompositeScorer
-from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
+from simulator.capture.batch import CaptureBatch, FrameStatistics
 from simulator.capture.columns import MOVES
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import CodeMeans, Transitions
@@ -43,7 +43,7 @@ from simulator.utils.compute import outside_inference_mode
 #: Samples that are recorded and scored together, at most.
 CHUNK_SAMPLES = 2**24
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
-#: Outputs of `FrameSource.record`, and the one that each kind of observation is made of.
+#: Outputs of `CaptureBatch.record`, and the one that each kind of observation is made of.
 _DTYPES = {"codes": np.uint8, "linear": np.float32, "images": np.float32, "numbers": np.uint16}
 _OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "linear", "dn": "numbers"}
 
@@ -82,7 +82,7 @@ class Task:
     at least `measure`, `reward` and `score_table`.
     """
 
-    outputs: tuple[str, ...] = ()  # of `FrameSource.record`, that `measure` reads
+    outputs: tuple[str, ...] = ()  # of `CaptureBatch.record`, that `measure` reads
 
     def __init__(self, episodes: Episodes) -> None:
         self.episodes = episodes
@@ -147,6 +147,8 @@ class Task:
 
 #: `CaptureBatch.transitions`: light and exposures behind the frames of scenes (B,) at states (B,).
 FindTransitions = Callable[[np.ndarray, np.ndarray], Transitions]
+#: What records frames: it simulates them, or looks them up.
+FrameSource = CaptureBatch | LookupBatch
 #: Constructor of a task, from the episodes, what records their frames, the scorer, and the light
 #: and exposures behind frames where rewards are expectations.
 MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | None], Task]
@@ -301,7 +303,7 @@ class EpisodeCore:
         return Frames(observation, info, reward, raw)
 
     def _memory(self, count: int, name: str) -> Any:
-        """Memory for `count` frames of an output of `FrameSource.record`."""
+        """Memory for `count` frames of an output of `CaptureBatch.record`."""
         shape, device = (count, 4, *[self.options.resolution] * 2), self.options.torch_device
         if device is None:
             return np.empty(shape, _DTYPES[name])

@@ -10,7 +10,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from simulator.camera import LOW_CLIP, CameraProfile
-from simulator.capture.batch import MODULES, FrameSource, FrameStatistics
+from simulator.capture.batch import MODULES, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import LEAST_SIGNALS, CodeMeans
 from simulator.noise.generator import noise_keys
@@ -19,8 +19,10 @@ from simulator.noise.generator import noise_keys
 RECORDED, _MODULE = "recorded", len(MODULES)
 
 
-class LookupBatch(FrameSource):
+class LookupBatch:
     """Looks frames up, where `simulator.capture.batch.CaptureBatch` would photograph them.
+
+    It is used alike. Nothing is cached or planned.
 
     The scenes have `Scene.recorded`; `prepared` returns the merged light of one by its index.
     """
@@ -34,6 +36,12 @@ class LookupBatch(FrameSource):
         self._scenes, self._prepared = scenes, prepared
         self._span, self._black = camera.digits[:2, :, None, None]
         self._white = camera.white_level
+
+    def forget(self, indices: np.ndarray) -> None:
+        """See `CaptureBatch.forget`."""
+
+    def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
+        """See `CaptureBatch.prepare`."""
 
     def prepared_scene(self, index: int) -> PreparedScene:
         """The merged light of the scene `index`."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,53 +65,11 @@ class FrameStatistics:
     keys: np.ndarray  # of the noise, uint64
 
 
-class FrameSource(Protocol):
-    """Frames of n scenes, each at any of S states: simulated, or looked up if they were recorded.
+class CaptureBatch:
+    """Frames of n scenes, each at any of S states, simulated.
 
     For each batch of frames, call `prepare`, then `record`. When another scene is to be shown under
     an index, call `forget` first.
-    """
-
-    def forget(self, indices: np.ndarray) -> None:
-        """Drops all that is cached for the scenes `indices`, if any is."""
-        return
-
-    def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
-        """Plans the next frames, and makes their light.
-
-        All are (B,): scenes, the state of each, and its light relative to the scene's own.
-        """
-        return
-
-    def record(
-        self,
-        indices: np.ndarray,
-        states: np.ndarray,
-        seeds: np.ndarray,
-        frames: np.ndarray,
-        row_gain: np.ndarray | None = None,
-        means: CodeMeans | None = None,
-        **outputs: Any,
-    ) -> FrameStatistics:
-        """Records scenes that are prepared, and fills the outputs.
-
-        Args:
-            indices, states: As they were prepared.
-            seeds: (B,) integers >= 0, of the noise.
-            frames: (B,) numbers that the noise of one seed differs by.
-            row_gain: (B, H) light of each row relative to the gain that was prepared for; None
-                where all rows have the same.
-            means, outputs: Those of `simulator.capture.sensor.record`, arrays or, where there is
-                a device, tensors on it, but then no `means`. These stay empty where there is
-                `FrameStatistics.source_noise`, on which what they should sum depends.
-        """
-
-    def prepared_scene(self, index: int) -> PreparedScene:
-        """The scene `index` in its own light, as it is photographed."""
-
-
-class CaptureBatch:
-    """`FrameSource` that simulates the frames.
 
     `prepared` returns the scene of an index, in its own light, when it is first photographed. Of
     indices (K,), `moved` returns the scenes that they show in motion, -1 for none, and how these
@@ -188,7 +146,7 @@ class CaptureBatch:
         return made, (self._prepared, self.num_scenes, self.states, self.camera)
 
     def forget(self, indices: np.ndarray) -> None:
-        """See `FrameSource`; the memory is used again."""
+        """Drops all that is cached for the scenes `indices`; the memory is used again."""
         pending, self._pending = self._pending, None
         if pending is not None:  # what its light is made of may be gone before
             indices = np.union1d(indices, pending[1].passes["scene"])
@@ -203,11 +161,13 @@ class CaptureBatch:
         self._blurred_row[indices] = -1
 
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
-        """See `FrameSource`."""
+        """Plans the next frames, and makes their light.
+
+        All are (B,): scenes, the state of each, and its light relative to the scene's own.
+        """
         rows = indices * len(self.states) + states
         self._finish()
-        stale = np.flatnonzero(self._gain[rows] != gains)
-        if len(stale):
+        if np.count_nonzero(stale := self._gain[rows] != gains):
             self._plan(indices[stale], rows[stale], gains[stale])
         with self._forgetting(indices):
             self._make_light(indices, rows)
@@ -254,7 +214,18 @@ class CaptureBatch:
         means: CodeMeans | None = None,
         **outputs: Any,
     ) -> FrameStatistics:
-        """See `FrameSource`."""
+        """Records scenes that are prepared, and fills the outputs.
+
+        Args:
+            indices, states: As they were prepared.
+            seeds: (B,) integers >= 0, of the noise.
+            frames: (B,) numbers that the noise of one seed differs by.
+            row_gain: (B, H) light of each row relative to the gain that was prepared for; None
+                where all rows have the same.
+            means, outputs: Those of `simulator.capture.sensor.record`, arrays or, where there is
+                a device, tensors on it, but then no `means`. These stay empty where there is
+                `FrameStatistics.source_noise`, on which what they should sum depends.
+        """
         rows = indices * len(self.states) + states
         read_noise, run = self._read_noise, None
         together = len(indices) >= 2 * torch.get_num_threads()
@@ -306,7 +277,7 @@ class CaptureBatch:
             parallel_ranges(lambda *_: photograph(counter, *given), torch.get_num_threads())
 
     def prepared_scene(self, index: int) -> PreparedScene:
-        """See `FrameSource`."""
+        """The scene `index` in its own light, as it is photographed."""
         if index not in self._scenes:
             scene = self._prepared(index)
             # Scenes that are shown several times share their light, but not what is blurred of it.
@@ -431,7 +402,7 @@ class CaptureBatch:
     def _make_light(self, indices: np.ndarray, rows: np.ndarray) -> None:
         """Finds the places of the light of `rows`, and makes what is not there."""
         source = np.zeros(len(rows), np.uintp)
-        if len(opened := np.flatnonzero(self._modules[rows] & _OPENING)):
+        if np.count_nonzero(opened := self._modules[rows] & _OPENING > 0):
             source[opened] = self._frames.places(self._open(rows[opened]))
         given = self._modules, self._rest, self._place
         missing = find_light(indices, rows, *given, self._blurred_row, self._blurred, source)

@@ -194,8 +194,9 @@ class PreparedScene:
 
         `gain` is a finite number >= 0.
         """
+        check_type("settings", settings, CameraSettings)
         check_number("gain", gain, 0.0, sys.float_info.max)
-        known = self._transition(settings, noise=False, gain=np.array([gain]))
+        ((_, known),) = self.transitions([settings], noise=False, gain=np.array([gain]))
         return (known.light[0] * known.table[0, 0, 0].item()).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
     def capture(
@@ -313,12 +314,6 @@ class PreparedScene:
             shares = None if self.nlf.is_zero else planned.shares[some]
             found = Transitions(lights, planned.table[some], shares)
             yield some, found.seen_by([self.response] * len(lights)) if noise else found
-
-    def _transition(self, settings: CameraSettings, **options: Any) -> Transitions:
-        """The one of `transitions` at `settings`."""
-        check_type("settings", settings, CameraSettings)
-        ((_, found),) = self.transitions([settings], **options)
-        return found
 
     def _frames(self, count: int, out: torch.Tensor | None) -> torch.Tensor:
         """Memory for `count` frames, `out` if that fits."""

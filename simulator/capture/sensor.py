@@ -239,7 +239,7 @@ def record(
     light, remaining, read = transitions.light, transitions.remaining_variance, None
     frames, samples = len(light), math.prod(transitions.shape[1:])
     pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
-    counts = np.empty((frames * 4 * pieces if count else 0, 2), np.int64)
+    counts = np.empty((2, frames * 4 * pieces if count else 0), np.int64)
     shares = np.zeros(frames, np.uintp) if remaining is None else addresses(remaining)
     drawn = None if keys is None or noise == "bank" else True
     if keys is not None and read_noise is not None:
@@ -274,7 +274,7 @@ def record(
         run(4 * pieces, whole)
     if means is not None and size == 1:
         means.fill(codes)
-    return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)
+    return counts.reshape(2, frames, -1).sum(axis=2).T
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -676,8 +676,8 @@ def record_units(  # type: ignore[no-untyped-def]
                 if signals[k].size:
                     _as_signals(out, black, span, _LEAST[k], signals[k][frame, plane, start:end])
         if counts.size:
-            counts[unit, 0] = (clipped & (_HIGH - 1)).sum()
-            counts[unit, 1] = (clipped >> _HIGH_BITS).sum()
+            counts[0, unit] = (clipped & (_HIGH - 1)).sum()
+            counts[1, unit] = (clipped >> _HIGH_BITS).sum()
         if means[2].size and (unit + 1) % (4 * pieces) == 0:
             mean_codes(frame, frame + 1, codes, *means)
 

@@ -84,13 +84,13 @@ class NetworkCache:
 
     def _fingerprint(self, module: nn.Module) -> str:
         """Digest of the module's weights, computed again only after one was changed in place."""
-        state = module.state_dict()
+        tensors = [t.detach() for t in (*module.parameters(), *module.buffers())]
         # Fused optimisers change values without counting it, so the sums are compared, too.
-        sums = torch.stack([tensor.sum(dtype=torch.float64) for tensor in state.values()])
-        marks = [*sums.tolist(), *((t.data_ptr(), _changes(t)) for t in state.values())]
+        sums = torch.stack([tensor.sum(dtype=torch.float64) for tensor in tensors])
+        marks = [*sums.tolist(), *((t.data_ptr(), _changes(t)) for t in tensors)]
         known = self._fingerprints.get(id(module))
         if known is None or known[0] != marks:
-            known = self._fingerprints[id(module)] = marks, content_digest(state)
+            known = self._fingerprints[id(module)] = marks, content_digest(module.state_dict())
         return known[1]
 
 

@@ -31,9 +31,8 @@ from simulator.utils.compute import addresses, as_pointer, kernel, parallel_rang
 LIGHT_LIMIT = 1e9
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32
-#: Kernels wider than this are applied in the Fourier domain; and where the kernel for the CPU does
-#: the sum of a single image.
-_FFT_TAPS, _DIRECT_TAPS = 11, 41
+#: Kernels up to this wide are applied as a sum of shifts on the CPU, to a single image.
+_DIRECT_TAPS = 41
 #: Discs wider than this are cheaper in the Fourier domain than as a sum, in a batch [pixel].
 WIDE_PX = 40.0
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
@@ -151,16 +150,12 @@ def disc_blur(light: Tensor, diameter_px: float) -> Tensor:
     if taps <= _DIRECT_TAPS and has_kernels(light):
         return path_blur(light, Taps(*grid_taps(weights, -reach, -reach)))
     disc = torch.from_numpy(weights).to(light.device)
-    # float64: a GPU rounds convolutions in float32 to TF32, and in a Fourier transform a lamp a
-    # thousand times above white must not leave ringing in the shadows.
+    # float64: a lamp a thousand times above white must not leave ringing in the shadows.
     planes = light.reshape(-1, 1, *light.shape[-2:])
     padded = F.pad(planes, (reach,) * 4, mode="replicate").double()
-    if taps <= _FFT_TAPS:
-        blurred = F.conv2d(padded, disc[None, None])
-    else:
-        size = padded.shape[-2:]
-        spectrum = torch.fft.rfft2(padded) * torch.fft.rfft2(disc, s=size)
-        blurred = torch.fft.irfft2(spectrum, s=size)[..., taps - 1 :, taps - 1 :]
+    size = padded.shape[-2:]
+    spectrum = torch.fft.rfft2(padded) * torch.fft.rfft2(disc, s=size)
+    blurred = torch.fft.irfft2(spectrum, s=size)[..., taps - 1 :, taps - 1 :]
     return blurred.to(light.dtype).reshape(light.shape)
 
 

@@ -41,8 +41,8 @@ _LENGTH_POINTS = 32
 _TOP = np.int64(0)
 #: Taps that are added to all rows together, and samples of the rows that are looked at.
 _TAPS, _BAND = 128, 2**17
-#: Shares below this are left out.
-_LEAST_WEIGHT = 1e-9
+#: Shares below this are left out; at more of its ends than this, nothing else is left of a streak.
+_LEAST_WEIGHT, _LARGEST_SHARE = 1e-9, 1e20
 _jit = functools.partial(kernel, fastmath={"contract"})
 
 
@@ -105,7 +105,7 @@ def streak(extent_px, width):  # type: ignore[no-untyped-def]
     n = int((math.sqrt(1.0 + extent_px * extent_px) - 1.0) / 2.0)  # n (n + 1) / 3 is it at e = 0
     end = (target - n * (n + 1) / 3.0) * (2 * n + 1) / (2.0 * ((n + 1) ** 2 - target))
     radius = max(min(n + 1, width - 1), 1)
-    return radius, max(end, 0.0) + (n + 1 - radius)
+    return radius, min(max(end, 0.0) + (n + 1 - radius), _LARGEST_SHARE)
 
 
 def motion_blur(light: Tensor, extent_px: float) -> Tensor:
@@ -118,11 +118,6 @@ def motion_blur(light: Tensor, extent_px: float) -> Tensor:
         fixed = radius, share, np.float32(math.inf)
         return by_rows(light, lambda a, b, rows, to: move_rows(a, b, rows, *fixed, to))
     full = 1.0 / (2 * radius - 1 + 2.0 * share)
-    if radius >= width - 1:  # see `_move_whole_rows`
-        column, rows = torch.arange(width, device=light.device), light.double()
-        left, right = radius - 1 - column + share, column + radius - width + share
-        total = rows.sum(-1, keepdim=True) + rows[..., :1] * left + rows[..., -1:] * right
-        return (total * full).to(light.dtype)
     padded = F.pad(light.reshape(-1, 1, width), (radius, radius), mode="replicate")
     sums = F.pad(padded.double().cumsum(-1), (1, 0))
     inner = sums[..., 2 * radius : 2 * radius + width] - sums[..., 1 : 1 + width]
@@ -176,21 +171,6 @@ def pad_rows(rows, y, top, bottom, radius, limit, padded):  # type: ignore[no-un
 
 
 @_jit()
-def _move_whole_rows(first, last, rows, radius, end, limit, out):  # type: ignore[no-untyped-def]
-    """`move_rows` where the streak covers all of a row: pixels at the borders are counted."""
-    width, full = rows.shape[1], 1.0 / (2 * radius - 1 + 2.0 * end)
-    for y in range(first, last):
-        total = 0.0
-        for x in range(width):
-            total += min(max(rows[y, x], -limit), limit)
-        begin = min(max(rows[y, 0], -limit), limit)
-        behind = min(max(rows[y, width - 1], -limit), limit)
-        for x in range(width):
-            left, right = radius - 1 - x + end, x + radius - width + end
-            out[y, x] = np.float32((total + begin * left + behind * right) * full)
-
-
-@_jit()
 def _box(current, following, length, out):  # type: ignore[no-untyped-def]
     """Sums over samples 1 to `length` from each one on; overwrites `current`."""
     size, offset, power = len(current), 1, 1
@@ -212,9 +192,6 @@ def _box(current, following, length, out):  # type: ignore[no-untyped-def]
 def move_rows(first, last, rows, radius, end, limit, out):  # type: ignore[no-untyped-def]
     """Rows `first` to `last` behind a `streak` of this radius and share of its ends."""
     width = rows.shape[1]
-    if radius >= width - 1:
-        _move_whole_rows(first, last, rows, radius, end, limit, out)
-        return
     full, share = np.float32(1.0 / (2 * radius - 1 + 2.0 * end)), np.float32(end)
     pitch = width + 2 * radius
     many = max(1, _GROUP // pitch)
