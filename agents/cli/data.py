@@ -290,5 +290,5 @@ def _use_rest() -> None:
     blurs = np.array([(0.0, 2.5, True, *[0] * 10, vignetting.ctypes.data)], BLUR)
     first = np.zeros(1, np.int64)
     frames = BlurredFrames(1, 1, 0)
-    frames.run(frames.plan(first, first, blurs, frames.places([light]))[1])
+    frames.run(frames.plan(first, first, blurs, frames.places([light]), first)[1])
     draw("dead_leaves", np.random.default_rng(0))  # the scenes may all have been in the cache

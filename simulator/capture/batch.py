@@ -191,6 +191,7 @@ class CaptureBatch:
             yield
         except BaseException:
             self.forget(indices)
+            self._frames.forget_discs()
             raise
 
     def _transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
@@ -410,10 +411,14 @@ class CaptureBatch:
             return
         indices, rows = indices[missing], rows[missing]
         slots, blurs = self._slots[rows - indices * len(self.states)], self._blur.take(rows)
-        self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, source[missing])
+        rest, light = self._rest[indices], source[missing]
+        owners = np.where(light == self._place[rest, 0], rest, self.num_scenes + indices)
+        self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, light, owners)
+        first = planned.passes["kind"] <= blurred_frames.LEVEL  # others wait for these
+        if np.count_nonzero(first):
+            self._frames.run(planned._replace(passes=planned.passes[first]))
+            planned = planned._replace(passes=planned.passes[~first])
         self._blurred_row[indices], self._pending = rows, (len(source), planned)
-        if (planned.passes["kind"] == blurred_frames.WIDE).any():  # which no kernel does
-            self._finish()
         if self._noises is not None:
             rows = rows[np.isnan(self._excess_variance[rows])]
             if len(rows):  # depends on the pixels

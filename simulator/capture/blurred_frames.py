@@ -69,8 +69,9 @@ class Passes(NamedTuple):
     levels: np.ndarray  # (K, 13) places that blends read
 
 
-#: Kinds of passes, in the order in which a frame has them.
-WIDE, DISC, BLEND, ALONG_ROWS, ALONG_PATH, DARKEN = range(6)
+#: Kinds of passes, in the order in which a frame has them. Discs are too wide for a sum of shifts,
+#: for blends of several frames, or for one.
+WIDE, LEVEL, DISC, BLEND, ALONG_ROWS, ALONG_PATH, DARKEN = range(7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,19 +199,19 @@ class BlurredFrames:
     """Blurred light of a batch's scenes, in memory that is used again.
 
     The light behind the lens is cached for each of `num_apertures`, and the discs that it is
-    blended of; where all memory together exceeds `most_bytes`, only the latest light. Frames are
-    (4, H, W), as the lights are that `places` is given. Each is known by its place, here the
-    address of its memory; 0 is none.
+    blended of, which several scenes may share; where all memory together exceeds `most_bytes`, only
+    the latest light. Frames are (4, H, W), as the lights are that `places` is given. Each is known
+    by its place, here the address of its memory; 0 is none.
     """
 
     def __init__(self, num_scenes: int, num_apertures: int, most_bytes: int) -> None:
         self._most_bytes, self._shape = most_bytes, tuple[int, ...]()
-        # Places that each scene holds: behind the lens at each aperture, behind each disc, in
-        # motion, and of its layout where that is a frame, too.
-        self._held = np.zeros((num_scenes, num_apertures + len(discs.DIAMETERS) + 2), np.uintp)
-        # The light that each was made of, and at each aperture the diameter of the disc.
-        self._source = np.zeros_like(self._held)
+        # Places that each scene holds: behind the lens at each aperture, in motion, and of its
+        # layout where that is a frame, too. The light that each was made of, and the disc.
+        self._held, self._source = np.zeros((2, num_scenes, num_apertures + 2), np.uintp)
         self._diameter = np.zeros((num_scenes, num_apertures))
+        # The same behind each disc of the bank, by the `owners` of `plan`.
+        self._discs, self._disc_source = np.zeros((2, 2 * num_scenes, len(_DISCS)), np.uintp)
         self._slabs = list[torch.Tensor]()
         # Places, of which the first are free, and how many: an array, which kernels change at once
         # with what is held, whatever interrupts their caller.
@@ -267,29 +268,52 @@ class BlurredFrames:
 
     def release(self, indices: np.ndarray) -> None:
         """Frees the memory of the scenes `indices`."""
-        places = self._held[np.unique(indices)]
-        self._held[indices] = 0  # first: an interrupt may cost memory, but nothing has two owners
+        self._release(self._held, indices)
+        self._release(self._discs, np.append(indices, indices + len(self._held)))
+
+    def _release(self, held: np.ndarray, rows: np.ndarray) -> None:
+        places = held[np.unique(rows)]
+        held[rows] = 0  # first: an interrupt may cost memory, but nothing has two owners
         self._give_back(places)
 
+    def forget_discs(self) -> None:
+        """Makes every disc again when it is needed next; the memory stays."""
+        self._disc_source[:] = 0
+
     def plan(
-        self, indices: np.ndarray, slots: np.ndarray, blurs: np.ndarray, source: np.ndarray
+        self,
+        indices: np.ndarray,
+        slots: np.ndarray,
+        blurs: np.ndarray,
+        source: np.ndarray,
+        owners: np.ndarray,
     ) -> tuple[np.ndarray, Passes]:
         """(K,) places of the light of scenes `indices` behind their blurs, and what makes it.
 
         `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the places of the light
         (4, H, W) that they start from. Each stays until its scene blurs another. No two have the
-        scene in common; in new memory, where nothing moves, no two the scene and the aperture.
+        scene in common. Those with an owner in common share discs, and start from the same light:
+        `owners` (K,) are scenes, or, counted on from these, scenes that share with no other.
         """
         if self.is_full:  # light at these apertures, or in motion, and layouts stay
             others = self._held[indices]
             others[np.arange(len(indices)), slots] = others[:, -2:] = 0
             self._held[indices] -= others
             self._give_back(others)
+            self._release(self._discs, owners)
         count, done, planned, lacking = len(indices), 0, 0, 0
         light, levels = np.empty(count, np.uintp), np.empty((count, len(discs.DIAMETERS)), np.uintp)
         passes = np.empty(count * (len(discs.DIAMETERS) + 3), PASS)
-        held = self._held, self._source, self._diameter
-        frames = indices, slots, blurs, source, float(sum(self._shape[1:])), discs.radius_table()
+        held = self._held, self._source, self._diameter, self._discs, self._disc_source
+        frames = (
+            indices,
+            slots,
+            blurs,
+            source,
+            owners,
+            float(sum(self._shape[1:])),
+            discs.radius_table(),
+        )
         while done < count:
             if lacking:
                 self._grow(lacking)
@@ -333,12 +357,13 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
     Returns:
         The frames that are done, the passes, and how many places lack.
     """
-    indices, slots, blurs, source, longest, table = frames
-    held, sources, diameters = memory
+    indices, slots, blurs, source, owners, longest, table = frames
+    held, sources, diameters, banks, bank_sources = memory
     (free, left), (light, levels, passes) = spare, made
-    needed, lens = np.zeros(len(_KNOTS), np.bool_), diameters.shape[1]
+    needed = np.zeros(len(_KNOTS), np.bool_)
     for k in range(done, len(indices)):
         scene, slot, blur, at = indices[k], slots[k], blurs[k], source[k]
+        bank, origins = banks[owners[k]], bank_sources[owners[k]]
         diameter, blends, moved = blur.defocus_px, blur.diameter > 0, held.shape[1] - 2
         known = held[scene, slot] > 0 and sources[scene, slot] == at
         known = known and diameters[scene, slot] == diameter
@@ -351,8 +376,8 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
             needed[0] = False
         lacking = (new and not held[scene, slot]) + (changes and not held[scene, moved])
         for level in range(len(needed)):
-            if held[scene, lens + level]:
-                needed[level] &= sources[scene, lens + level] != at
+            if bank[level]:
+                needed[level] &= origins[level] != at
             else:
                 lacking += needed[level]
         if lacking > left[0]:
@@ -361,11 +386,11 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
         if new:
             for level in range(len(needed) if blends else 0):
                 if needed[level]:
-                    to = _hold(held[scene], lens + level, free, left)
-                    sources[scene, lens + level] = at
+                    to, origins[level] = _hold(bank, level, free, left), at
                     planned = _add_disc(passes, planned, k, scene, at, to, _DISCS[level], table)
-                if held[scene, lens + level] and sources[scene, lens + level] == at:
-                    levels[k, level] = held[scene, lens + level]
+                    passes[planned - 1].kind = LEVEL
+                if bank[level] and origins[level] == at:
+                    levels[k, level] = bank[level]
             to = _hold(held[scene], slot, free, left)
             sources[scene, slot], diameters[scene, slot] = at, diameter
             if blends:
@@ -493,4 +518,4 @@ def darken(first, last, parts, shape, passes, blurs, levels):  # type: ignore[no
                 out[y, x] = light[y, x] * left[y % shape[1], x]
 
 
-_TASKS: Any = None, blur_discs, blend_discs, move_along_rows, move_along_paths, darken
+_TASKS: Any = None, blur_discs, blur_discs, blend_discs, move_along_rows, move_along_paths, darken

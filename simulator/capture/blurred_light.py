@@ -248,13 +248,10 @@ class BlurredLight:
         if not len(todo):
             return result
         sources = [lights[i].float().contiguous() for i in todo]
-        slots = np.arange(len(todo))
-        frames = new_frames(len(todo), len(todo), 0, None if device.type == "cpu" else device)
-        places = frames.places(sources)
-        # One light out of focus shares discs; each motion or vignetting has memory of its own.
-        same = np.unique(places, return_inverse=True)[1]
-        indices = np.where(changes[todo], slots, same)
-        done, planned = frames.plan(indices, slots, blurs[todo], places)
+        frames = new_frames(len(todo), 1, 0, None if device.type == "cpu" else device)
+        places, indices = frames.places(sources), np.arange(len(todo))
+        owners = np.unique(places, return_inverse=True)[1]
+        done, planned = frames.plan(indices, 0 * indices, blurs[todo], places, owners)
         frames.run(planned)
         for i, light in zip(todo.tolist(), frames.kept(done), strict=True):
             result[i] = light

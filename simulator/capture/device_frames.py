@@ -90,7 +90,15 @@ class DeviceFrames(BlurredFrames):
     # -- passes -------------------------------------------------------------------------------
 
     def _run(self, kind: int, alike: Passes) -> None:
-        tasks = self._blur, self._blur, self._blend, self._move, self._move, self._darken
+        tasks = (
+            self._blur,
+            self._blur,
+            self._blur,
+            self._blend,
+            self._move,
+            self._move,
+            self._darken,
+        )
         own = alike.passes["frame"]
         tasks[kind](alike.passes, alike.blurs[own], alike.levels[own])
 

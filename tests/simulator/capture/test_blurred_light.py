@@ -14,9 +14,9 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposur
 from simulator.capture import batch as batch_module
 from simulator.capture import blurred_frames
 from simulator.capture.batch import MODULES, CaptureBatch
-from simulator.capture.blurred_frames import Layout
+from simulator.capture.blurred_frames import BlurredFrames, Layout
 from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
-from simulator.capture.columns import noise_columns, plan_captures
+from simulator.capture.columns import MOVES, noise_columns, plan_captures
 from simulator.capture.plan import noise_balances
 from simulator.capture.sensor import record
 from simulator.capture.statistics import DenoisedLight, Residual
@@ -245,10 +245,10 @@ def test_many_images_are_scipys_correlation(threads, most_bytes, monkeypatch):
     lights = list(torch.rand(7, *shape, generator=torch.Generator().manual_seed(0)))
     lights[1][2, 7, 9] = lights[2][0, 3, 4] = 1e30  # clipped first
     lights[3][1, 5, 6], atol = -1e30, {1: 3000.0, 2: 300.0, 3: 300.0}
-    frames = blurred_frames.BlurredFrames(9, 2, most_bytes)
+    frames = BlurredFrames(9, 2, most_bytes)
     for used in (np.arange(7), np.array([5, 2]), np.arange(4)):
         some = frames.places([lights[i] for i in used])
-        made, planned = frames.plan(used + 1, np.zeros(len(used), int), blurs[used], some)
+        made, planned = frames.plan(used + 1, 0 * used, blurs[used], some, used)
         frames.run(planned)
         for i, found in zip(used, frames.at(made), strict=True):
             rtol, clipped = 2e-4 if i == 0 else 1e-5, lights[i].double().clamp(-1e9, 1e9).numpy()
@@ -434,6 +434,43 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
     for states in (changed, 0):
         expected, _ = photographed(made(noise), states)
         np.testing.assert_array_equal(photographed(batch, states)[0], expected)
+
+
+@pytest.mark.parametrize("case", ["clean", "interrupted", "two lights"])
+def test_discs_are_made_once_for_all_that_show_a_scene(case, monkeypatch) -> None:
+    """Where a network has denoised the light of some of them, these share no disc."""
+    still, kinds = {"image_speed": 0.0, "movement": Movement()}, list[int]()
+    scene = prepared(8).changed(defocus=2.0, **still)
+    if case == "two lights":
+        networks = (DenoisedLight(0.5 * scene.light, residual=Residual.alike(0.01)),)
+        scene = replace(scene, nlf=Z6.nlf(800), denoised_lights=networks)
+    shown, run = [scene.changed(defocus=2.0 + i) for i in range(10)], BlurredFrames.run
+    chosen = np.array([1, 2] * 5), np.full(10, 5), np.array([2, 1] * 5)
+    wanted = [[alone(shown[i], s[i], 1.0, int(KEYS[i]))[0] for i in range(10)] for s in chosen]
+
+    def moved(indices):
+        moves = np.zeros(len(indices), MOVES)
+        moves["defocus"] = 2.0 + indices
+        return np.where(indices, 0, -1), moves
+
+    def counted(frames, planned):
+        kinds.extend(planned.passes["kind"])
+        if case == "interrupted" and len(kinds) == len(planned.passes):
+            raise KeyboardInterrupt
+        run(frames, planned)
+
+    monkeypatch.setattr(BlurredFrames, "run", counted)
+    batch = CaptureBatch(
+        lambda _: scene, 10, STATES, Z6, noise="bank", light_bytes=2**30, moved=moved
+    )
+    if case == "interrupted":
+        with pytest.raises(KeyboardInterrupt):
+            batch.prepare(SCENES[1:], chosen[0][1:], np.ones(9))
+    for states, expected in zip(chosen, wanted, strict=True):
+        np.testing.assert_array_equal(photographed(batch, states)[0], expected)
+        batch.forget(SCENES[1:])
+    times = {"clean": 1, "interrupted": 2}.get(case, math.inf)
+    assert 0 < kinds.count(blurred_frames.LEVEL) <= times * (len(DIAMETERS) - 1)
 
 
 def test_an_interrupt_while_the_noise_of_averages_is_new(monkeypatch) -> None:
