@@ -127,11 +127,8 @@ def statistics_column(scene: PreparedScene) -> np.ndarray:
 
 def opening_column(scene: PreparedScene, states: np.ndarray) -> np.ndarray:
     """(S,) diameters of the blur that opening the aperture adds at `STATE` (S,) [pixel]."""
-    blur = scene.aperture_blur
-    if blur is None:
-        return np.zeros(len(states))
-    numbers, which = np.unique(states["f_number"], return_inverse=True)
-    return np.array([blur.extent(f_number) for f_number in numbers.tolist()])[which]
+    blur, numbers = scene.aperture_blur, states["f_number"].tolist()
+    return np.array([0.0 if blur is None else blur.extent(f_number) for f_number in numbers])
 
 
 def noise_column(scene: PreparedScene, states: np.ndarray, *, errors: bool) -> np.ndarray:

@@ -148,9 +148,14 @@ class Transitions:
         """`table` in which each source's noise is what its blur leaves in the mean."""
         if self.remaining_variance is None:
             return self.table
-        shares = self.remaining_variance
+        found = np.unique(
+            addresses(self.remaining_variance), return_index=True, return_inverse=True
+        )
+        shares = [
+            self.remaining_variance[i] for i in found[1].tolist()
+        ]  # many frames have the same
         left = [1.0 if share is None else float(share.mean()) for share in shares]
-        remaining, table = np.array(left, np.float32)[:, None, None], self.table.copy()
+        remaining, table = np.array(left, np.float32)[found[2], None, None], self.table.copy()
         table[:, 1:3] += (1.0 - remaining) * table[:, 3:]
         table[:, 3:] *= remaining
         return table
