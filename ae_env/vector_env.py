@@ -220,16 +220,16 @@ class AutoExposureVectorEnv(
         a mask beside it.
         """
         info: dict[str, Any] = {}
-        some = len(env_indices) < self.num_envs
-        masks = np.full((len(columns), self.num_envs), not some)
+        partial = len(env_indices) < self.num_envs
+        masks = np.full((len(columns), self.num_envs), not partial)
         masks[:, env_indices] = True
         masks = self.core.options.placed(masks)
         for mask, (name, values) in zip(masks, columns.items(), strict=True):
-            if some:
+            if partial:
                 made: Any = torch.zeros if torch.is_tensor(values) else np.zeros
-                known, shape = values, (self.num_envs, *values.shape[1:])
-                values = self.core.options.placed(made(shape, dtype=known.dtype))
-                values[env_indices] = known
+                some, shape = values, (self.num_envs, *values.shape[1:])
+                values = self.core.options.placed(made(shape, dtype=some.dtype))
+                values[env_indices] = some
             info[name], info[f"_{name}"] = values, mask
         return info
 

@@ -30,7 +30,7 @@ CALLERS = {
     "_photograph": "blur, frames, sums of codes",
     "blur": "sharpness of each capture",
     "record": "frames, sums of codes",
-    "_run": "discs of new scenes",
+    "_run": "blur before frames",
 }
 
 

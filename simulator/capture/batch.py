@@ -179,10 +179,11 @@ class CaptureBatch:
 
     def _finish(self) -> None:
         """Makes the light that is planned."""
-        pending, self._pending = self._pending, None
-        if pending is not None:
-            with self._forgetting(pending[1].passes["scene"]):
-                self._frames.run(pending[1])
+        if self._pending is not None:
+            planned = self._pending[1]
+            with self._forgetting(planned.passes["scene"]):
+                self._pending = None  # not before: an interrupt may come anywhere
+                self._frames.run(planned)
 
     @contextmanager
     def _forgetting(self, indices: np.ndarray) -> Iterator[None]:
@@ -269,8 +270,9 @@ class CaptureBatch:
     def _photograph(self, indices: np.ndarray, units: int, fixed: tuple[Any, ...]) -> None:
         """Makes the light that is planned, and records frames of `indices` (B,)."""
         assert self._pending is not None
-        planned, self._pending = self._pending[1], None
+        planned = self._pending[1]
         with self._forgetting(indices):
+            self._pending = None
             order = np.empty(len(planned.passes) + len(indices), np.int64)
             counter, ends = np.zeros(1, np.int64), np.zeros(len(indices) + 1, np.int64)
             deal_out(planned.passes, indices, self.num_scenes, order, ends)
@@ -414,7 +416,8 @@ class CaptureBatch:
         rest, light = self._rest[indices], source[missing]
         owners = np.where(light == self._place[rest, 0], rest, self.num_scenes + indices)
         self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, light, owners)
-        first = planned.passes["kind"] <= blurred_frames.LEVEL  # others wait for these
+        # Wide discs, which no kernel makes, and those that blends of several frames wait for.
+        first = planned.passes["kind"] <= blurred_frames.LEVEL
         if np.count_nonzero(first):
             self._frames.run(planned._replace(passes=planned.passes[first]))
             planned = planned._replace(passes=planned.passes[~first])

@@ -69,8 +69,8 @@ class Passes(NamedTuple):
     levels: np.ndarray  # (K, 13) places that blends read
 
 
-#: Kinds of passes, in the order in which a frame has them. Discs are too wide for a sum of shifts,
-#: for blends of several frames, or for one.
+#: Kinds of passes, in the order in which a frame has them. A disc is `WIDE` (made in the Fourier
+#: domain), `LEVEL` (one of the bank, for all blends of its owner) or `DISC` (that of one frame).
 WIDE, LEVEL, DISC, BLEND, ALONG_ROWS, ALONG_PATH, DARKEN = range(7)
 
 
@@ -259,7 +259,8 @@ class BlurredFrames:
 
     def _more(self, count: int) -> np.ndarray:
         """Places of new memory for `count` frames or more."""
-        spare = min(_SLAB, self._most_bytes // 4) // math.prod(self._shape)
+        room = max(self._most_bytes - self._bytes, 0) // 4
+        spare = min(_SLAB, room) // math.prod(self._shape)
         size = max(count, spare), *self._shape
         slab = torch.empty(size, dtype=torch.float32, device="cpu")  # whatever torch's defaults are
         self._slabs.append(slab)
@@ -275,6 +276,14 @@ class BlurredFrames:
         places = held[np.unique(rows)]
         held[rows] = 0  # first: an interrupt may cost memory, but nothing has two owners
         self._give_back(places)
+
+    def _drop_discs(self, lacking: int, owners: np.ndarray) -> bool:
+        """Whether discs of others are freed, lest memory for more frames exceed its limit."""
+        if self._bytes + lacking * 4 * math.prod(self._shape) <= self._most_bytes:
+            return False
+        others = np.setdiff1d(np.flatnonzero(self._discs.any(axis=1)), owners)
+        self._release(self._discs, others)
+        return len(others) > 0
 
     def forget_discs(self) -> None:
         """Makes every disc again when it is needed next; the memory stays."""
@@ -292,8 +301,10 @@ class BlurredFrames:
 
         `slots` (K,) are their apertures, `blurs` `BLUR`; `source` are the places of the light
         (4, H, W) that they start from. Each stays until its scene blurs another. No two have the
-        scene in common. Those with an owner in common share discs, and start from the same light:
-        `owners` (K,) are scenes, or, counted on from these, scenes that share with no other.
+        scene in common. Of those with one of the `owners` (K,) in common, discs of the bank are
+        made once: they start from the same light. An owner is a scene, whose light it is, or one
+        that shares it with no other, counted on behind all scenes. `LEVEL` passes are to be done
+        before others are put off.
         """
         if self.is_full:  # light at these apertures, or in motion, and layouts stay
             others = self._held[indices]
@@ -315,7 +326,7 @@ class BlurredFrames:
             discs.radius_table(),
         )
         while done < count:
-            if lacking:
+            if lacking and not self._drop_discs(lacking, owners):
                 self._grow(lacking)
             free, made = (self._free, self._left), (light, levels, passes)
             done, planned, lacking = plan_passes(done, planned, frames, held, free, made)
@@ -388,13 +399,13 @@ def plan_passes(done, planned, frames, memory, spare, made):  # type: ignore[no-
                 if needed[level]:
                     to, origins[level] = _hold(bank, level, free, left), at
                     planned = _add_disc(passes, planned, k, scene, at, to, _DISCS[level], table)
-                    passes[planned - 1].kind = LEVEL
+                    passes[planned - 1].kind = LEVEL  # none of the bank is wide
                 if bank[level] and origins[level] == at:
                     levels[k, level] = bank[level]
             to = _hold(held[scene], slot, free, left)
             sources[scene, slot], diameters[scene, slot] = at, diameter
             if blends:
-                planned = _add(passes, planned, BLEND, k, scene, at, to, 200.0)
+                planned = _add(passes, planned, BLEND, k, scene, at, to, 50.0)
             else:
                 planned = _add_disc(passes, planned, k, scene, at, to, diameter, table)
         if diameter > 0.0:

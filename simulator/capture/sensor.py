@@ -148,14 +148,11 @@ class Transitions:
         """`table` in which each source's noise is what its blur leaves in the mean."""
         if self.remaining_variance is None:
             return self.table
-        found = np.unique(
-            addresses(self.remaining_variance), return_index=True, return_inverse=True
-        )
-        shares = [
-            self.remaining_variance[i] for i in found[1].tolist()
-        ]  # many frames have the same
-        left = [1.0 if share is None else float(share.mean()) for share in shares]
-        remaining, table = np.array(left, np.float32)[found[2], None, None], self.table.copy()
+        shares = self.remaining_variance  # of which many frames have the same
+        _, first, which = np.unique(addresses(shares), return_index=True, return_inverse=True)
+        distinct = [shares[i] for i in first.tolist()]
+        left = [1.0 if share is None else float(share.mean()) for share in distinct]
+        remaining, table = np.array(left, np.float32)[which, None, None], self.table.copy()
         table[:, 1:3] += (1.0 - remaining) * table[:, 3:]
         table[:, 3:] *= remaining
         return table

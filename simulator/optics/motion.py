@@ -41,8 +41,8 @@ _LENGTH_POINTS = 32
 _TOP = np.int64(0)
 #: Taps that are added to all rows together, and samples of the rows that are looked at.
 _TAPS, _BAND = 128, 2**17
-#: Shares below this are left out; at more of its ends than this, nothing else is left of a streak.
-_LEAST_WEIGHT, _LARGEST_SHARE = 1e-9, 1e20
+#: Shares below this are left out; longest streak [pixel]: of a longer one its ends are left alone.
+_LEAST_WEIGHT, _LONGEST = 1e-9, 2e8
 _jit = functools.partial(kernel, fastmath={"contract"})
 
 
@@ -101,11 +101,12 @@ def streak(extent_px, width):  # type: ignore[no-untyped-def]
     ``(n (n + 1) (2 n + 1) / 3 + 2 e (n + 1)^2) / (2 n + 1 + 2 e)``, solved for both. Where the
     streak reaches beyond a whole row, its ends, which show the border, stand for the rest.
     """
+    extent_px = min(extent_px, _LONGEST)
     target = extent_px * extent_px / 12.0
     n = int((math.sqrt(1.0 + extent_px * extent_px) - 1.0) / 2.0)  # n (n + 1) / 3 is it at e = 0
     end = (target - n * (n + 1) / 3.0) * (2 * n + 1) / (2.0 * ((n + 1) ** 2 - target))
     radius = max(min(n + 1, width - 1), 1)
-    return radius, min(max(end, 0.0) + (n + 1 - radius), _LARGEST_SHARE)
+    return radius, max(end, 0.0) + (n + 1 - radius)
 
 
 def motion_blur(light: Tensor, extent_px: float) -> Tensor:

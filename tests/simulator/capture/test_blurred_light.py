@@ -298,8 +298,20 @@ def prepared(index: int) -> PreparedScene:
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 
 
-def made(noise="bank", *, light_bytes=2**30, scenes=prepared, camera=Z6):
-    return CaptureBatch(scenes, 10, STATES, camera, noise=noise, light_bytes=light_bytes)
+def made(noise="bank", *, light_bytes=2**30, scenes=prepared, camera=Z6, moved=None):
+    known = {"noise": noise, "light_bytes": light_bytes, "moved": moved}
+    return CaptureBatch(scenes, 10, STATES, camera, **known)
+
+
+def defocused(rest, defocus):
+    """`moved` of a batch: scenes at `rest` (10,) that others show out of focus, -1 for none."""
+
+    def moved(indices):
+        moves = np.zeros(len(indices), MOVES)
+        moves["defocus"] = defocus[indices]
+        return rest[indices], moves
+
+    return moved
 
 
 def photographed(batch, states, gains=(1.0,) * 10, **options):
@@ -411,18 +423,27 @@ def test_forgotten_scenes_are_asked_for_again() -> None:
     np.testing.assert_array_equal(after, first)
 
 
-@pytest.mark.parametrize("stage", ["photograph", "noise_balances", "opening_errors", "plan_passes"])
-def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, stage: str) -> None:
-    """While light is blurred, once it is, while frames are planned, once memory is taken."""
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    noise = None if stage == "photograph" else "bank"
-    module = blurred_frames if stage == "plan_passes" else batch_module
+@pytest.mark.parametrize("threads", [2, 61])
+@pytest.mark.parametrize(
+    "stage", ["photograph", "noise_balances", "opening_errors", "plan_passes", "_forgetting"]
+)
+def test_an_interrupted_batch_is_made_again(stage, threads, monkeypatch) -> None:
+    """While light is blurred, once it is, while frames are planned, once memory is taken, and just
+    before planned light is made, with the frames or, for many threads, before them."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    stage = "_run" if stage == "photograph" and threads == 61 else stage
+    noise = None if stage in ("photograph", "_run", "_forgetting") else "bank"
+    modules = {"plan_passes": blurred_frames, "_forgetting": CaptureBatch, "_run": BlurredFrames}
+    module = modules.get(stage, batch_module)
     batch, calls, original = made(noise), [], getattr(module, stage)
     changed = 5 if stage == "opening_errors" else 1
+    broken = 4 if stage == "_forgetting" else changed
     photographed(batch, 0), photographed(batch, changed)
 
     def fail(*args, **kwargs):
         calls.append(args)
+        if stage == "_forgetting" and len(calls) == 1:  # of `prepare`
+            return original(*args)
         if stage == "plan_passes":
             original(*args)
         raise KeyboardInterrupt
@@ -430,10 +451,10 @@ def test_an_interrupted_batch_is_made_again(monkeypatch: pytest.MonkeyPatch, sta
     with monkeypatch.context() as patch:
         patch.setattr(module, stage, fail)
         with pytest.raises(KeyboardInterrupt):
-            photographed(batch, changed, [3.0] * 10)
-    for states in (changed, 0):
-        expected, _ = photographed(made(noise), states)
-        np.testing.assert_array_equal(photographed(batch, states)[0], expected)
+            photographed(batch, broken, [3.0] * 10)
+    for given in ((broken, [3.0] * 10), (changed,), (0,)):
+        expected, _ = photographed(made(noise), *given)
+        np.testing.assert_array_equal(photographed(batch, *given)[0], expected)
 
 
 @pytest.mark.parametrize("case", ["clean", "interrupted", "two lights"])
@@ -448,11 +469,6 @@ def test_discs_are_made_once_for_all_that_show_a_scene(case, monkeypatch) -> Non
     chosen = np.array([1, 2] * 5), np.full(10, 5), np.array([2, 1] * 5)
     wanted = [[alone(shown[i], s[i], 1.0, int(KEYS[i]))[0] for i in range(10)] for s in chosen]
 
-    def moved(indices):
-        moves = np.zeros(len(indices), MOVES)
-        moves["defocus"] = 2.0 + indices
-        return np.where(indices, 0, -1), moves
-
     def counted(frames, planned):
         kinds.extend(planned.passes["kind"])
         if case == "interrupted" and len(kinds) == len(planned.passes):
@@ -460,9 +476,8 @@ def test_discs_are_made_once_for_all_that_show_a_scene(case, monkeypatch) -> Non
         run(frames, planned)
 
     monkeypatch.setattr(BlurredFrames, "run", counted)
-    batch = CaptureBatch(
-        lambda _: scene, 10, STATES, Z6, noise="bank", light_bytes=2**30, moved=moved
-    )
+    moved = defocused(np.where(SCENES, 0, -1), 2.0 + SCENES)
+    batch = made(scenes=lambda _: scene, moved=moved)
     if case == "interrupted":
         with pytest.raises(KeyboardInterrupt):
             batch.prepare(SCENES[1:], chosen[0][1:], np.ones(9))
@@ -471,6 +486,21 @@ def test_discs_are_made_once_for_all_that_show_a_scene(case, monkeypatch) -> Non
         batch.forget(SCENES[1:])
     times = {"clean": 1, "interrupted": 2}.get(case, math.inf)
     assert 0 < kinds.count(blurred_frames.LEVEL) <= times * (len(DIAMETERS) - 1)
+
+
+def test_discs_of_scenes_that_are_not_shown_make_room() -> None:
+    """A frame has 7.5 KiB: the light of one scene with all its discs fits, that of two does not."""
+    scene, rest = prepared(8).changed(image_speed=0.0, movement=Movement()), np.full(10, -1)
+    moved = defocused(rest, np.full(10, scene.defocus))
+    batch = made(None, light_bytes=16 * 7680, scenes=lambda _: scene, moved=moved)
+    wanted, own = scene.expected(STATES[1]).clamp(0.0, 1.0), np.array([9])
+    for rest[9] in range(9):
+        frame = np.empty((1, 4, 24, 20), np.float32)
+        batch.prepare(own, own - 8, np.ones(1))
+        batch.record(own, own - 8, own, own, images=frame)
+        torch.testing.assert_close(torch.from_numpy(frame[0]), wanted, atol=1e-3, rtol=0)
+        batch.forget(own)
+    assert not batch._frames.is_full
 
 
 def test_an_interrupt_while_the_noise_of_averages_is_new(monkeypatch) -> None:
