@@ -41,7 +41,7 @@ _LENGTH_POINTS = 32
 _TOP = np.int64(0)
 #: Taps that are added to all rows together, and samples of the rows that are looked at.
 _TAPS, _BAND = 128, 2**17
-#: Shares below this are left out; longest streak [pixel]: of a longer one its ends are left alone.
+#: Shares below this are left out; longer streaks count as this long [pixel].
 _LEAST_WEIGHT, _LONGEST = 1e-9, 2e8
 _jit = functools.partial(kernel, fastmath={"contract"})
 
