@@ -202,6 +202,9 @@ def test_no_or_bad_extents():
     light = lamp(4, 8, 8)
     assert motion_blur(light, 0.0) is light
     assert disc_blur(light, 0.0) is light
+    for bright in (torch.full((2, 7), 1e30), torch.full((2, 7), 1e30, dtype=torch.float64)):
+        for extent in (1e12, 1e300):  # no sum and no square overflows
+            torch.testing.assert_close(motion_blur(bright, extent), bright)
     view = torch.stack([light, light], dim=-1)[..., 0]  # not contiguous
     assert all(torch.equal(blur(view, 4.0), blur(light, 4.0)) for blur in (motion_blur, disc_blur))
     for bad in (-1.0, math.nan, math.inf):
