@@ -222,7 +222,8 @@ class AutoExposureVectorEnv(
         info: dict[str, Any] = {}
         partial = len(env_indices) < self.num_envs
         masks = np.full((len(columns), self.num_envs), not partial)
-        masks[:, env_indices] = True
+        if partial:
+            masks[:, env_indices] = True
         masks = self.core.options.placed(masks)
         for mask, (name, values) in zip(masks, columns.items(), strict=True):
             if partial:

@@ -76,6 +76,8 @@ class DeviceFrames(BlurredFrames):
             return self._free[:0]
         begin = len(old)
         spare = max(begin // 2, min(_FRAMES, self._samples // math.prod(self._shape)))
+        room = self._most_bytes // (4 * math.prod(self._shape)) - begin
+        spare = min(spare, room) if lacking <= room else spare
         self._frames = old.new_empty(begin + max(lacking, spare), *self._shape)
         self._bytes = self._frames.nbytes
         if begin:
@@ -90,15 +92,7 @@ class DeviceFrames(BlurredFrames):
     # -- passes -------------------------------------------------------------------------------
 
     def _run(self, kind: int, alike: Passes) -> None:
-        tasks = (
-            self._blur,
-            self._blur,
-            self._blur,
-            self._blend,
-            self._move,
-            self._move,
-            self._darken,
-        )
+        tasks = *[self._blur] * 3, self._blend, self._move, self._move, self._darken
         own = alike.passes["frame"]
         tasks[kind](alike.passes, alike.blurs[own], alike.levels[own])
 

@@ -298,8 +298,8 @@ def prepared(index: int) -> PreparedScene:
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 
 
-def made(noise="bank", *, light_bytes=2**30, scenes=prepared, camera=Z6, moved=None):
-    known = {"noise": noise, "light_bytes": light_bytes, "moved": moved}
+def made(noise="bank", *, light_bytes=2**30, scenes=prepared, camera=Z6, **known):
+    known |= {"noise": noise, "light_bytes": light_bytes}
     return CaptureBatch(scenes, 10, STATES, camera, **known)
 
 
@@ -488,17 +488,19 @@ def test_discs_are_made_once_for_all_that_show_a_scene(case, monkeypatch) -> Non
     assert 0 < kinds.count(blurred_frames.LEVEL) <= times * (len(DIAMETERS) - 1)
 
 
-def test_discs_of_scenes_that_are_not_shown_make_room() -> None:
+@pytest.mark.parametrize("device", [None, torch.device("cpu")])
+def test_discs_of_scenes_that_are_not_shown_make_room(device) -> None:
     """A frame has 7.5 KiB: the light of one scene with all its discs fits, that of two does not."""
     scene, rest = prepared(8).changed(image_speed=0.0, movement=Movement()), np.full(10, -1)
     moved = defocused(rest, np.full(10, scene.defocus))
-    batch = made(None, light_bytes=16 * 7680, scenes=lambda _: scene, moved=moved)
+    known = {"light_bytes": 16 * 7680, "moved": moved, "device": device}
+    batch = made(None, scenes=lambda _: scene, **known)
     wanted, own = scene.expected(STATES[1]).clamp(0.0, 1.0), np.array([9])
     for rest[9] in range(9):
-        frame = np.empty((1, 4, 24, 20), np.float32)
+        frame = torch.empty(1, 4, 24, 20)
         batch.prepare(own, own - 8, np.ones(1))
         batch.record(own, own - 8, own, own, images=frame)
-        torch.testing.assert_close(torch.from_numpy(frame[0]), wanted, atol=1e-3, rtol=0)
+        torch.testing.assert_close(frame[0], wanted, atol=1e-3, rtol=0)
         batch.forget(own)
     assert not batch._frames.is_full
 
