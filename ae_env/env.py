@@ -85,13 +85,17 @@ class AutoExposure(Task):
         count, states = len(episodes.begun), len(episodes.grid)
         lights = len(episodes.scenes) + count
         self._known = [n for n, part in torch_parts.items() if depends_on(part) != "image"]
-        self._scores = np.zeros((lights, states, len(self._known)))
+        self._scores = np.zeros((len(self._known), lights * states))
         self._scored = np.zeros((lights, states), bool)
         # Of the parts that depend on a scene's light alone; NaN where they are not known.
         self._of_light = [n for n in self._known if depends_on(torch_parts[n]) == "light"]
-        self._light_scores = np.full((len(episodes.scenes), states, len(self._of_light)), np.nan)
+        self._light_scores = np.full((len(self._of_light), len(episodes.scenes), states), np.nan)
         self._unlit = len(episodes.scenes)  # of how many scenes they are not
         self._sharp = terms.only_sharpness
+        # Whether these are looked up or in closed form, and worth no memory: episodes differ.
+        at_rest = options.motion in ("none", 0.0) and options.depth in ("far", 0.0)
+        direct = len(self._of_light) + len(self._sharp) == len(self._known)
+        self._fleeting = direct and not at_rest
         self._means = options.placed(np.zeros((lights, states, 3) if expected else 0))
         self._expected = np.zeros((lights, states), bool)  # whether these means are known
         self._shown = ShownScenes(episodes.scenes, terms.captures)
@@ -152,13 +156,13 @@ class AutoExposure(Task):
         """(B,) each; 0 in the first frame of an episode."""
         episodes, costs = self.episodes, self.episodes.options.costs
         found: dict[str, Any] = {}
-        first = episodes.previous[env_indices] < 0
         if means is not None:
             change = abs(means - episodes.image_mean[env_indices])  # NaN where no frame was before
             found["flicker"] = (torch if torch.is_tensor(change) else np).nan_to_num(change)
             episodes.image_mean[env_indices] = means
         if "switch" in costs:
             now = episodes.grid.controls(episodes.state[env_indices])
+            first = episodes.previous[env_indices] < 0
             before = episodes.grid.controls(np.where(first, 0, episodes.previous[env_indices]))
             found["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
         return found
@@ -189,8 +193,9 @@ class AutoExposure(Task):
     def _score(self, frames: FrameBatch) -> dict[str, Any]:
         """Scores (B,) of the captures by part."""
         episodes, terms = self.episodes, self._terms
-        boxes = episodes.box_factor[episodes.scene[frames.env_indices]]
-        source_noise = frames.statistics.source_noise
+        boxes, source_noise = episodes.box_factor, frames.statistics.source_noise
+        if self._transitions is not None or source_noise is not None:
+            boxes = boxes[episodes.scene[frames.env_indices]]
         if source_noise is not None:
             source_noise = source_noise * np.square(boxes)[:, None, None]
         captures: Captures | None = None
@@ -221,20 +226,20 @@ class AutoExposure(Task):
         """Scores (B,) in static light of the parts that look at no frame."""
         episodes, env_indices = self.episodes, frames.env_indices
         clean = source_noise is None or self._terms.ignores_noise
-        if clean and len(self._of_light) + len(self._sharp) == len(self._known):
+        if clean and self._fleeting:
             return self._clean_scores(frames, env_indices)
-        lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
-        new = np.flatnonzero(~self._scored[lights, states]) if self._known else lights[:0]
-        if len(new):
+        rows = episodes.light_index.take(env_indices) * self._scored.shape[1]
+        rows += episodes.state.take(env_indices)
+        if np.count_nonzero(known := self._scored.take(rows)) < len(rows) and self._known:
+            new = np.flatnonzero(~known)
             if source_noise is None or not source_noise[new].any():
                 found = self._clean_scores(frames, env_indices[new], new)
             else:  # blur averages it
                 described = self._describe(frames, source_noise, new)
                 found = self._terms.torch_scores(None, described, "light", "blur")
-            each = np.stack([found[name] for name in self._known], axis=1)
-            self._scores[lights[new], states[new]] = each
-            self._scored[lights[new], states[new]] = True
-        return dict(zip(self._known, self._scores[lights, states].T, strict=True))
+            self._scores[:, rows[new]] = [found[name] for name in self._known]
+            self._scored.reshape(-1)[rows[new]] = True
+        return dict(zip(self._known, self._scores.take(rows, axis=1), strict=True))
 
     def _clean_scores(
         self, frames: FrameBatch, env_indices: np.ndarray, part: Any = slice(None)
@@ -246,16 +251,18 @@ class AutoExposure(Task):
         episodes, found = self.episodes, {}
         scenes, states = episodes.scene[env_indices], episodes.state[env_indices]
         if self._of_light:
-            known = self._light_scores[scenes, states]
-            if self._unlit and (unknown := np.isnan(known[:, 0])).any():
+            lit = self._light_scores.reshape(len(self._of_light), -1)
+            rows = scenes * self._scored.shape[1] + states
+            known = lit.take(rows, axis=1)
+            if self._unlit and (unknown := np.isnan(known[0])).any():
                 for scene, k in {scenes.item(i): i for i in np.flatnonzero(unknown)}.items():
                     light = episodes.light_index.item(env_indices[k])
                     shown = episodes.scenes[scene], self._captures.prepared_scene(light)
                     of_light = self._terms.closed_form_terms(*shown, "light")
-                    self._light_scores[scene] = np.stack([*of_light.values()], axis=1)
+                    self._light_scores[:, scene] = [*of_light.values()]
                     self._unlit -= 1
-                known = self._light_scores[scenes, states]
-            found = dict(zip(self._of_light, known.T, strict=True))
+                known = lit.take(rows, axis=1)
+            found = dict(zip(self._of_light, known, strict=True))
         if self._sharp:
             *_, scores = self._shown.blur(scenes, states, **self._moves(env_indices))
             found |= dict.fromkeys(self._sharp, scores)

@@ -186,8 +186,9 @@ class AutoExposureVectorEnv(
         whole = len(finished) == self.num_envs
         last = vars(frames) if whole else _rows_of(vars(frames), finished)
         final_obs = np.full(self.num_envs, None, dtype=object)
-        for row, i in enumerate(finished.tolist()):
-            final_obs[i] = {name: values[row] for name, values in last["observation"].items()}
+        names = last["observation"].keys()
+        for i, *values in zip(finished.tolist(), *last["observation"].values(), strict=True):
+            final_obs[i] = dict(zip(names, values, strict=True))
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[finished] = True
         placed = self.core.options.placed

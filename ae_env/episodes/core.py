@@ -281,7 +281,7 @@ class EpisodeCore:
         shown = {"raw": raw}
         if options.observation == "statistics":
             shown = (frame_statistics if options.device is None else tensor_statistics)(raw)
-        observation = shown | {"settings": self._settings[states]}
+        observation = shown | {"settings": self._settings.take(states, axis=0)}
         if options.sensors:
             speed, focus_drive = episodes.speed[env_indices], episodes.focus_drive[env_indices]
             normals = columns.pop("sensor_normals")
@@ -289,7 +289,7 @@ class EpisodeCore:
         terms, reward = self.task.reward(env_indices, columns)
         observation |= self.task.observation(env_indices)
         info: dict[str, Any] = {"scene_id": episodes.scene[env_indices], "state": states}
-        info |= zip(_STATE_INFO, self._state_info[:, states], strict=True)
+        info |= zip(_STATE_INFO, self._state_info.take(states, axis=1), strict=True)
         info |= columns | {f"rewards.{name}": values for name, values in terms.items()}
         if options.with_subject:
             info["subject"] = np.zeros((len(states), *[options.resolution] * 2), bool)

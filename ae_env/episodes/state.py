@@ -203,7 +203,8 @@ class Episodes:
         state = self._starts[scene, (start * self._num_starts[scene]).astype(np.int64)]
         for i, one in enumerate(chosen):
             state[i] = one.get("state", state[i])
-        discs = np.exp(DEFOCUS_SIGMA * normals_above(defocus)) * DEFOCUS_MEDIAN
+        drawn = normals_above(np.stack([defocus, speed, subject_speed, turn]))
+        discs = np.exp(DEFOCUS_SIGMA * drawn[0]) * DEFOCUS_MEDIAN
         discs = np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
         discs = _fixed_or_drawn(self.options.depth, discs)
         own_blur = self._own_blur[scene] * 64.0 / self.options.resolution
@@ -214,13 +215,13 @@ class Episodes:
         if self.options.motion != "random":  # one speed of the whole image
             subject_moves = np.zeros(len(scene), bool)
         median = self._median_speed[scene]
-        shake, subject = (np.exp(SPEED_SIGMA * normals_above(u)) for u in (speed, subject_speed))
+        shake, subject = np.exp(SPEED_SIGMA * drawn[1:3])
         return {
             "scene": self._shown_at(scene, frame),
             "state": state,
             "speed": _fixed_or_drawn(self.options.motion, shakes * shake * median),
             "direction": 2.0 * math.pi * direction,
-            "turn": TURN_SIGMA * normals_above(turn),
+            "turn": TURN_SIGMA * drawn[3],
             "subject_speed": subject_moves * subject * median,
             "subject_direction": 2.0 * math.pi * subject_direction,
             "defocus": discs,
@@ -261,7 +262,8 @@ class Episodes:
         Returns those that show another scene now, the next of their sequence.
         """
         self.previous[env_indices] = self.state[env_indices]
-        self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
+        if self.pending.shape[1] > 1:
+            self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
         self.pending[env_indices, -1] = actions
         in_effect = [self.pending[env_indices, -1 - delay] for delay in self._delays]
         mixed = in_effect[0] if len(in_effect) == 1 else self.grid.mixed(*in_effect)

@@ -301,7 +301,7 @@ def _score(part: Any, means: Any, captures: Captures | None) -> Any:
         scores = part(None, captures)
         return scores.to(means) if placed else np.asarray(scores.numpy())
     values, exp = means[:, column], torch.exp if placed else np.exp
-    return values.clip(0.0, 1.0) if column == 2 else exp(-values / part.scale)
+    return values.clip(None, 1.0) if column == 2 else exp(values / -part.scale)
 
 
 def _means_by_torch(

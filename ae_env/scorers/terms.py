@@ -20,6 +20,7 @@ from ae_env.scorers.captures import Captures, ColourMatrix, DependsOn, Domain, S
 from ae_env.utils.user_files import UserCodeError
 from simulator.raw.develop import develop_known
 from simulator.utils.checks import as_float
+from simulator.utils.compute import kernel
 
 logger = logging.getLogger(__name__)
 
@@ -379,15 +380,27 @@ class Balanced(CompositeScorer):
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total of the parts' `scores`: tensors, arrays of any one shape, or numbers."""
-        # Those of arrays by NumPy: torch's threads do not survive a fork.
-        placed = torch.is_tensor(scores["highlights"])
-        log: Any = torch.log if placed else np.log
-        least: Any = torch.clamp_min if placed else np.maximum
-        parts: Mapping[str, Any] = self.parts
-        blown = -parts["highlights"].scale * log(scores["highlights"])
-        blocked = -parts["shadows"].scale * log(scores["shadows"])
-        # Rounding may leave a share above 1.
-        score = least(1.0 - blown**4, 0.0) * least(1.0 - blocked**4, 0.0)
-        for name, weight in self.weights.items():
-            score = score * scores[name] ** weight
-        return score
+        values, weights = [scores[name] for name in self.weights], [*self.weights.values()]
+        faults = {name: self.parts[name].scale for name in ("highlights", "shadows")}  # type: ignore[attr-defined]
+        if any(map(torch.is_tensor, values)):
+            left = [1.0 - (torch.log(scores[name]) * faults[name]) ** 4 for name in faults]
+            factors: Any = [*(share.clamp(min=0.0) for share in left), *map(pow, values, weights)]
+            return math.prod(factors)
+        columns = np.array(values, np.float64)
+        totals = np.empty(columns.shape[1:])
+        fixed = np.array(weights), np.array([*faults.values()])
+        _balance(columns.reshape(len(columns), -1), *fixed, totals.reshape(-1))
+        return totals[()]
+
+
+@kernel()
+def _balance(scores, weights, scales, totals):  # type: ignore[no-untyped-def]
+    """`Balanced.combine` of `scores` (5, N), whose shares of faults have these `scales` (2,)."""
+    for i in range(len(totals)):
+        total = 1.0
+        for fault in range(2):
+            left = 1.0 - (scales[fault] * math.log(scores[1 + fault, i])) ** 4
+            total *= 0.0 if left < 0.0 else left  # rounding may leave a share above 1
+        for part in range(len(weights)):
+            total *= scores[part, i] ** weights[part]
+        totals[i] = total

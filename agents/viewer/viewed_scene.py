@@ -306,7 +306,7 @@ class ViewedScene:
     def _costs(self, table: ScoreTable) -> dict[str, tuple[float, float]]:
         costs = {}
         for name, score in table.parts.items():
-            perfect = float(self._scorer.combine({**table.parts, name: np.ones(1)})[0])
+            perfect = float(self._scorer.combine({**table.parts, name: np.ones_like(score)})[0])
             costs[name] = float(score[0]), max(perfect - float(table.mean[0]), 0.0)
         return dict(sorted(costs.items(), key=lambda item: -item[1][1]))
 

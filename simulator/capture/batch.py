@@ -25,7 +25,7 @@ from simulator.capture.statistics import BINS
 from simulator.noise.generator import Noise, noise_keys
 from simulator.noise.noise_level_function import ReadNoises
 from simulator.settings import CameraSettings
-from simulator.utils.compute import kernel, parallel_ranges, take_next
+from simulator.utils.compute import add_to, kernel, parallel_ranges
 
 #: What it costs to record a frame, in the unit of `simulator.capture.blurred_frames.PASS`.
 RECORDING = 100.0
@@ -169,13 +169,12 @@ class CaptureBatch:
         self._finish()
         if np.count_nonzero(stale := self._gain[rows] != gains):
             self._plan(indices[stale], rows[stale], gains[stale])
-        with self._forgetting(indices):
-            self._make_light(indices, rows)
+        self._make_light(indices, rows)
 
     def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         """Light and exposures of the frames of scenes that are prepared; see `record`."""
         self._finish()
-        return self._transitions(indices, states)
+        return self._transitions(indices, indices * len(self.states) + states)
 
     def _finish(self) -> None:
         """Makes the light that is planned."""
@@ -195,8 +194,7 @@ class CaptureBatch:
             self._frames.forget_discs()
             raise
 
-    def _transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
-        rows = indices * len(self.states) + states
+    def _transitions(self, indices: np.ndarray, rows: np.ndarray) -> Transitions:
         remaining = None
         if self._noises is not None and (shares := self._share[rows]).any():
             remaining = blurred_frames.FramesAt(shares, self._size)
@@ -236,7 +234,7 @@ class CaptureBatch:
             self._finish()
         else:
             run = partial(self._photograph, indices)
-        keys, transitions = noise_keys(seeds, frames), self._transitions(indices, states)
+        keys, transitions = noise_keys(seeds, frames), self._transitions(indices, rows)
         source_noise = None
         if self._noises is not None and transitions.table[:, 3:].any():
             source_noise, means = transitions.averaged_table()[:, 3:], None
@@ -404,31 +402,31 @@ class CaptureBatch:
 
     def _make_light(self, indices: np.ndarray, rows: np.ndarray) -> None:
         """Finds the places of the light of `rows`, and makes what is not there."""
-        source = np.zeros(len(rows), np.uintp)
-        if np.count_nonzero(opened := self._modules[rows] & _OPENING > 0):
-            source[opened] = self._frames.places(self._open(rows[opened]))
-        given = self._modules, self._rest, self._place
+        source, given = np.empty(len(rows), np.uintp), (self._modules, self._rest, self._place)
         missing = find_light(indices, rows, *given, self._blurred_row, self._blurred, source)
         if not len(missing):
             return
-        indices, rows = indices[missing], rows[missing]
-        slots, blurs = self._slots[rows - indices * len(self.states)], self._blur.take(rows)
-        rest, light = self._rest[indices], source[missing]
-        owners = np.where(light == self._place[rest, 0], rest, self.num_scenes + indices)
-        self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, light, owners)
-        # Wide discs, which no kernel makes, and those that blends of several frames wait for.
-        first = planned.passes["kind"] <= blurred_frames.LEVEL
-        if np.count_nonzero(first):
-            self._frames.run(planned._replace(passes=planned.passes[first]))
-            planned = planned._replace(passes=planned.passes[~first])
-        self._blurred_row[indices], self._pending = rows, (len(source), planned)
-        if self._noises is not None:
-            rows = rows[np.isnan(self._excess_variance[rows])]
-            if len(rows):  # depends on the pixels
-                self._finish()
-                shares = blurred_frames.FramesAt(self._share[rows], self._size)
-                made = self._frames.at(self._blurred[rows]), shares, self._table[rows]
-                self._excess_variance[rows], _ = noise_balances(*made, self._target_noise(rows))
+        with self._forgetting(indices):
+            indices, rows, light = indices[missing], rows[missing], source[missing]
+            if np.count_nonzero(opened := light == 0):
+                light[opened] = self._frames.places(self._open(rows[opened]))
+            slots, blurs = self._slots[rows - indices * len(self.states)], self._blur.take(rows)
+            rest = self._rest[indices]
+            owners = np.where(light == self._place[rest, 0], rest, self.num_scenes + indices)
+            self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, light, owners)
+            # Wide discs, which no kernel makes, and those that blends of several frames wait for.
+            first = planned.passes["kind"] <= blurred_frames.LEVEL
+            if np.count_nonzero(first):
+                self._frames.run(planned._replace(passes=planned.passes[first]))
+                planned = planned._replace(passes=planned.passes[~first])
+            self._blurred_row[indices], self._pending = rows, (len(source), planned)
+            if self._noises is not None:
+                rows = rows[np.isnan(self._excess_variance[rows])]
+                if len(rows):  # depends on the pixels
+                    self._finish()
+                    shares = blurred_frames.FramesAt(self._share[rows], self._size)
+                    made = self._frames.at(self._blurred[rows]), shares, self._table[rows]
+                    self._excess_variance[rows], _ = noise_balances(*made, self._target_noise(rows))
 
     def _open(self, rows: np.ndarray) -> list[torch.Tensor]:
         """Light behind the open apertures of rows (K,); it stays until its scene is forgotten."""
@@ -461,7 +459,7 @@ def photograph(counter, order, ends, units, blurring, recording):  # type: ignor
     """
     passes = blurring[2]
     while True:
-        one = take_next(counter)  # type: ignore[call-arg, var-annotated]
+        one = add_to(counter, 0, 1)  # type: ignore[call-arg, var-annotated]
         if one >= len(ends) - 1:
             return
         for at in order[ends[one] : ends[one + 1]]:
@@ -520,13 +518,13 @@ def find_light(  # type: ignore[no-untyped-def]
     """The frames among `rows` (K,) of scenes `indices` whose light has to be blurred.
 
     See `CaptureBatch` for the columns. `source` (K,) become the places of the light that each frame
-    starts from, unless the aperture opens, and `blurred` those of the frames that need no blur.
+    starts from, 0 where the aperture opens, and `blurred` those of the frames that need no blur.
     """
     found, count = np.empty(len(rows), np.int64), 0
     for k in range(len(rows)):
-        if not modules[rows[k]] & _OPENING:
-            denoised = 1 if modules[rows[k]] & _DENOISING else 0
-            source[k] = place[rest[indices[k]], denoised]
+        denoised = 1 if modules[rows[k]] & _DENOISING else 0
+        opens = modules[rows[k]] & _OPENING
+        source[k] = 0 if opens else place[rest[indices[k]], denoised]
         if not modules[rows[k]] & _BLURRING:
             blurred[rows[k]] = source[k]
         elif blurred_row[indices[k]] != rows[k]:

@@ -56,6 +56,7 @@ from simulator.noise.noise_level_function import TAIL_STEPS, ReadNoises, plane_t
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
 from simulator.utils.compute import (
+    add_to,
     addresses,
     as_pointer,
     kernel,
@@ -227,13 +228,13 @@ def record(
             ``signals``, ``linear``, which are at least -`PEDESTAL`, and ``images``, at least 0.
 
     Returns:
-        (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`. A
-        tensor on the device of the light where `Transitions.needs_torch`.
+        (B, 2) float64: samples of each frame that are clipped low, and high; 0 without `count`. A
+        tensor of int64 on the device of the light where `Transitions.needs_torch`.
     """
     if unknown := [name for name in outputs if name not in _KINDS]:
         raise ValueError(f"`outputs` (={sorted(unknown)}) must be of {', '.join(_KINDS)}")
     if len(transitions.light) == 0:
-        return np.zeros((0, 2), np.int64)
+        return np.zeros((0, 2))
     if transitions.needs_torch:
         tensors = {name: torch.as_tensor(out) for name, out in outputs.items()}
         noises = keys, noise, read_noise
@@ -241,7 +242,7 @@ def record(
     light, remaining, read = transitions.light, transitions.remaining_variance, None
     frames, samples = len(light), math.prod(transitions.shape[1:])
     pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
-    counts = np.empty((2, frames * 4 * pieces if count else 0), np.int64)
+    counts = np.zeros((frames, 2))
     shares = np.zeros(frames, np.uintp) if remaining is None else addresses(remaining)
     drawn = None if keys is None or noise == "bank" else True
     if keys is not None and read_noise is not None:
@@ -258,7 +259,7 @@ def record(
         (addresses(light), shares, transitions.table),
         (_NO_KEYS, _NO_BANK) if keys is None else (keys, _NO_BANK if drawn else noise_bank()),
         camera.digits,
-        (codes, numbers, tuple(signals), counts),
+        (codes, numbers, tuple(signals), counts if count else counts[:0]),
     )
     # Means come with the frames where none of these is to be divided.
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
@@ -276,7 +277,7 @@ def record(
         run(4 * pieces, whole)
     if means is not None and size == 1:
         means.fill(codes)
-    return counts.reshape(2, frames, -1).sum(axis=2).T
+    return counts
 
 
 # -- the steps one by one ---------------------------------------------------------------------
@@ -678,8 +679,8 @@ def record_units(  # type: ignore[no-untyped-def]
                 if signals[k].size:
                     _as_signals(out, black, span, _LEAST[k], signals[k][frame, plane, start:end])
         if counts.size:
-            counts[0, unit] = (clipped & (_HIGH - 1)).sum()
-            counts[1, unit] = (clipped >> _HIGH_BITS).sum()
+            add_to(counts, 2 * frame, (clipped & (_HIGH - 1)).sum())
+            add_to(counts, 2 * frame + 1, (clipped >> _HIGH_BITS).sum())
         if means[2].size and (unit + 1) % (4 * pieces) == 0:
             mean_codes(frame, frame + 1, codes, *means)
 

@@ -225,7 +225,7 @@ _START_BITS = np.uint64(BANK_SIZE // STRIDE - 1)
 
 
 def normals_above(shares: np.ndarray) -> np.ndarray:
-    """(N,) standard normals that are above these shares of all; SciPy's takes 0.2 s to import."""
+    """Standard normals that are above these `shares` of all; SciPy's takes 0.2 s to import."""
     return np.asarray(torch.special.ndtri(torch.from_numpy(shares)))
 
 

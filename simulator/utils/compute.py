@@ -214,14 +214,18 @@ def load_alone(typing, words, index):  # type: ignore[no-untyped-def]
 
 
 @numba.extending.intrinsic
-def take_next(typing, counter):  # type: ignore[no-untyped-def]
-    """Counts ``counter[0]`` of int64 up, inside a kernel: what it was, to one thread alone."""
+def add_to(typing, numbers, index, more):  # type: ignore[no-untyped-def]
+    """Adds `more` to ``numbers[index]``, inside a kernel, and returns what it was.
+
+    The numbers, int64 or float64, may be those of other threads, too.
+    """
+    add = "add" if isinstance(numbers.dtype, types.Integer) else "fadd"
 
     def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        data = context.make_array(counter)(context, builder, args[0]).data
-        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
+        data = context.make_array(numbers)(context, builder, args[0]).data
+        return builder.atomic_rmw(add, builder.gep(data, [args[1]]), args[2], "monotonic")
 
-    return types.int64(counter), generate
+    return numbers.dtype(numbers, types.intp, numbers.dtype), generate
 
 
 #: Samples that `add_shifts` adds to.
