@@ -93,9 +93,8 @@ class AutoExposure(Task):
         self._unlit = len(episodes.scenes)  # of how many scenes they are not
         self._sharp = terms.only_sharpness
         # Whether these are looked up or in closed form, and worth no memory: episodes differ.
-        at_rest = options.motion in ("none", 0.0) and options.depth in ("far", 0.0)
         direct = len(self._of_light) + len(self._sharp) == len(self._known)
-        self._fleeting = direct and not at_rest
+        self._fleeting = direct and not episodes.at_rest
         self._means = options.placed(np.zeros((lights, states, 3) if expected else 0))
         self._expected = np.zeros((lights, states), bool)  # whether these means are known
         self._shown = ShownScenes(episodes.scenes, terms.captures)
@@ -109,7 +108,7 @@ class AutoExposure(Task):
         """Those of the terms; on a device the frames alone have what these need."""
         if not self._terms.parts or self._transitions or self.episodes.options.device is not None:
             return None
-        return self._terms.means_of(self.episodes.state[env_indices])
+        return self._terms.means_of(self.episodes.state.take(env_indices))
 
     def measure(self, frames: FrameBatch) -> dict[str, Any]:
         """Scores (B,) by ``score:`` and part, and ``image_mean`` where a cost needs it."""
@@ -131,7 +130,7 @@ class AutoExposure(Task):
 
         Takes the scores and the image means out of `columns`, and adds the oracle's.
         """
-        options, states = self.episodes.options, self.episodes.state[env_indices]
+        options, states = self.episodes.options, self.episodes.state.take(env_indices)
         tables: list[ScoreTable] = []
         if self._reads_tables or options.with_oracle:
             tables = [self.score_table(env_index) for env_index in env_indices.tolist()]
@@ -232,7 +231,7 @@ class AutoExposure(Task):
         rows += episodes.state.take(env_indices)
         if np.count_nonzero(known := self._scored.take(rows)) < len(rows) and self._known:
             new = np.flatnonzero(~known)
-            if source_noise is None or not source_noise[new].any():
+            if clean or source_noise is None or not source_noise[new].any():
                 found = self._clean_scores(frames, env_indices[new], new)
             else:  # blur averages it
                 described = self._describe(frames, source_noise, new)
@@ -249,7 +248,7 @@ class AutoExposure(Task):
         Motion is no matter to what depends on the light alone.
         """
         episodes, found = self.episodes, {}
-        scenes, states = episodes.scene[env_indices], episodes.state[env_indices]
+        scenes, states = episodes.scene.take(env_indices), episodes.state.take(env_indices)
         if self._of_light:
             lit = self._light_scores.reshape(len(self._of_light), -1)
             rows = scenes * self._scored.shape[1] + states
@@ -312,8 +311,9 @@ class AutoExposure(Task):
     def _moves(self, env_indices: np.ndarray) -> dict[str, Any]:
         """How the scenes move, as `SceneCaptures.of` takes it."""
         episodes = self.episodes
-        speed, defocus = episodes.speed[env_indices], episodes.defocus[env_indices]
-        return {"speed": speed, "defocus": defocus, "movements": episodes.movements[env_indices]}
+        speed, defocus = episodes.speed.take(env_indices), episodes.defocus.take(env_indices)
+        moves = episodes.movements.take(env_indices, axis=0)
+        return {"speed": speed, "defocus": defocus, "movements": moves}
 
 
 class AutoExposureBase:

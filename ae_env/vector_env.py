@@ -220,20 +220,16 @@ class AutoExposureVectorEnv(
         Every column has one entry per environment, 0 for those that are not in `env_indices`, and
         a mask beside it.
         """
-        info: dict[str, Any] = {}
-        partial = len(env_indices) < self.num_envs
+        placed, partial = self.core.options.placed, len(env_indices) < self.num_envs
         masks = np.full((len(columns), self.num_envs), not partial)
         if partial:
             masks[:, env_indices] = True
-        masks = self.core.options.placed(masks)
-        for mask, (name, values) in zip(masks, columns.items(), strict=True):
-            if partial:
-                made: Any = torch.zeros if torch.is_tensor(values) else np.zeros
-                some, shape = values, (self.num_envs, *values.shape[1:])
-                values = self.core.options.placed(made(shape, dtype=some.dtype))
-                values[env_indices] = some
-            info[name], info[f"_{name}"] = values, mask
-        return info
+            columns = dict(columns)
+            for name, some in columns.items():
+                made: Any = torch.zeros if torch.is_tensor(some) else np.zeros
+                columns[name] = placed(made((self.num_envs, *some.shape[1:]), dtype=some.dtype))
+                columns[name][env_indices] = some
+        return columns | {f"_{n}": mask for n, mask in zip(columns, placed(masks), strict=True)}
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:

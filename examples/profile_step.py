@@ -4,7 +4,9 @@
 with random actions on one thread, in motion and out of focus, or neither: `cached`. It times the
 sections that threads share (`simulator.utils.compute.parallel_ranges`); all else is the
 interpreter's, on one thread whatever there are. A step on n threads takes at least the rest and an
-n-th of the sections. The fused kernel of `ae-env bench throughput` runs in turns with the steps.
+n-th of the sections. The fused kernel of `ae-env bench throughput` runs in turns with the steps, as
+do steps without any section but plans (their frames are rubbish): what the interpreter takes beyond
+theirs, it waits for memory, as its code and data have left the processor's caches meanwhile.
 
 Then steps on one thread and on two take turns. With `cached`, so do steps, the benchmark's torch
 scorer on recorded frames (`LiveScore`), and steps with that scorer.
@@ -34,12 +36,17 @@ CALLERS = {
 }
 
 
-def timed_sections(spent):
-    """Makes every module's `parallel_ranges` add its seconds to `spent`, by the caller's name."""
+def timed_sections(spent, left_out):
+    """Makes every module's `parallel_ranges` add its seconds to `spent`, by the caller's name.
+
+    While there is something in `left_out`, it does nothing but plans.
+    """
     original = compute.parallel_ranges
 
     def timed(task, count, **options):
         name = sys._getframe(1).f_code.co_name
+        if left_out and name != "_plan_rows":
+            return
         begun = time.perf_counter()
         try:
             original(task, count, **options)
@@ -77,8 +84,8 @@ def main(size=64, num_envs=64, *, cached=False):
     actions = np.random.default_rng(0).integers(0, 64, (100 + ROUNDS * STEPS, num_envs))
     for chosen in actions[:100]:
         envs.step(chosen)
-    rows, spent = [], defaultdict(float)
-    timed_sections(spent)
+    rows, spent, left_out = [], defaultdict(float), []
+    timed_sections(spent, left_out)
     gc.collect()
     for chosen in np.split(actions[100:], ROUNDS):
         spent.clear()
@@ -91,15 +98,24 @@ def main(size=64, num_envs=64, *, cached=False):
         for _ in range(STEPS):
             kernel.step()
         rows.append({**spent, "whole": whole, "kernel": time.perf_counter() - begun})
+        left_out.append(True)
+        begun = time.perf_counter()
+        with np.errstate(all="ignore"):
+            for own in chosen:
+                envs.step(own)
+        rows[-1]["empty"] = time.perf_counter() - begun
+        left_out.clear()
+        envs.reset()
     scale = 1e6 / (STEPS * num_envs)
     names = {name for row in rows for name in row}
     of = {name: scale * np.median([row.get(name, 0.0) for row in rows]) for name in names}
-    whole, alone = of.pop("whole"), of.pop("kernel")
+    whole, alone, empty = (of.pop(name) for name in ("whole", "kernel", "empty"))
     rest = whole - sum(of.values())
     print(f"{num_envs} environments, {size} x {size}, microseconds a frame, median of {ROUNDS}")
     for name in sorted(of, key=of.get, reverse=True):
         print(f"{CALLERS.get(name, name):34} {of[name]:7.1f} {of[name] / whole:5.0%}")
     print(f"{'interpreter and NumPy':34} {rest:7.1f} {rest / whole:5.0%}")
+    print(f"{'steps without any section':34} {empty:7.1f}")
     print(f"{'the fused kernel alone':34} {alone:7.1f} {whole / alone:5.2f} times less")
     for threads in (1, 2, 8, 16):
         least = rest + (whole - rest) / threads

@@ -276,19 +276,20 @@ class EpisodeCore:
     def observe(self, env_indices: np.ndarray) -> Frames:
         """Captures the episodes of `env_indices` (B,), each in its current state."""
         episodes, options = self.episodes, self.options
-        states = episodes.state[env_indices]
+        states = episodes.state.take(env_indices)
         raw, columns = self._capture(env_indices)
         shown = {"raw": raw}
         if options.observation == "statistics":
             shown = (frame_statistics if options.device is None else tensor_statistics)(raw)
         observation = shown | {"settings": self._settings.take(states, axis=0)}
         if options.sensors:
-            speed, focus_drive = episodes.speed[env_indices], episodes.focus_drive[env_indices]
-            normals = columns.pop("sensor_normals")
-            observation["sensors"] = encode_sensors(speed, focus_drive, normals)
+            drive, normals = episodes.focus_drive.take(env_indices), columns.pop("sensor_normals")
+            observation["sensors"] = encode_sensors(
+                episodes.speed.take(env_indices), drive, normals
+            )
         terms, reward = self.task.reward(env_indices, columns)
         observation |= self.task.observation(env_indices)
-        info: dict[str, Any] = {"scene_id": episodes.scene[env_indices], "state": states}
+        info: dict[str, Any] = {"scene_id": episodes.scene.take(env_indices), "state": states}
         info |= zip(_STATE_INFO, self._state_info.take(states, axis=1), strict=True)
         info |= columns | {f"rewards.{name}": values for name, values in terms.items()}
         if options.with_subject:
@@ -314,7 +315,7 @@ class EpisodeCore:
         options, episodes = self.options, self.episodes
         size = options.resolution
         raw = self._memory(len(env_indices), _OUTPUTS[options.observation])
-        lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
+        lights, states = episodes.light_index.take(env_indices), episodes.state.take(env_indices)
         gains, rows = self._unchanged[: len(env_indices)], None
         if not episodes.static:
             gains, rows = episodes.gains(env_indices, self._state_info[1, states])
@@ -343,12 +344,12 @@ class EpisodeCore:
                 if kept is None or len(kept) < len(raw):
                     kept = self._outputs[name] = self._memory(len(raw), name)
                 outputs[name] = kept[: len(raw)]
-        means = self.task.code_means(env_indices)
+        means, scenes = self.task.code_means(env_indices), episodes.scene.take(env_indices)
         found = self._captures.record(
-            episodes.light_index[env_indices],
-            episodes.state[env_indices],
-            episodes.noise_seed[env_indices],
-            episodes.frame[env_indices],
+            episodes.light_index.take(env_indices),
+            episodes.state.take(env_indices),
+            episodes.noise_seed.take(env_indices),
+            episodes.frame.take(env_indices),
             row_gain=rows,
             means=means,
             **outputs,
@@ -359,7 +360,7 @@ class EpisodeCore:
             "excess_noise": found.excess_variance,
             "predicted_error": found.predicted_error,
             "modules": found.modules,
-            "illuminance_spread": episodes.illuminance_spread[episodes.scene[env_indices]],
+            "illuminance_spread": episodes.illuminance_spread.take(scenes),
         }
         if self.options.sensors:
             columns["sensor_normals"] = single_normals(found.keys, 2)

@@ -80,6 +80,7 @@ class Episodes:
 
     Attributes:
         static: Whether the light never changes.
+        at_rest: Whether nothing moves, all is in focus and lenses are as in the scenes.
         allowed: (scenes, S) bool, the states that each allows.
         box_factor: (scenes,) `Scene.box_factor`.
         begun: (n,) bool, whether there is an episode.
@@ -103,6 +104,8 @@ class Episodes:
         self.lighting: Lighting = options.make_lighting()
         self._lens = options.make_lens()
         self.static = type(self.lighting) is Lighting
+        still = options.motion in ("none", 0.0) and options.depth in ("far", 0.0)
+        self.at_rest = still and options.lens is None
         self.scenes = options.scenes_on_demand() if scenes is None else SceneSet.of(scenes)
         # With one delay of all controls a state needs not be put together.
         self._delays = options.delays if len(set(options.delays)) > 1 else options.delays[:1]
@@ -203,7 +206,8 @@ class Episodes:
         state = self._starts[scene, (start * self._num_starts[scene]).astype(np.int64)]
         for i, one in enumerate(chosen):
             state[i] = one.get("state", state[i])
-        drawn = normals_above(np.stack([defocus, speed, subject_speed, turn]))
+        drawn = np.stack([defocus, speed, subject_speed, turn])
+        drawn = 0.0 * drawn if self.at_rest else normals_above(drawn)
         discs = np.exp(DEFOCUS_SIGMA * drawn[0]) * DEFOCUS_MEDIAN
         discs = np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
         discs = _fixed_or_drawn(self.options.depth, discs)
@@ -261,7 +265,7 @@ class Episodes:
 
         Returns those that show another scene now, the next of their sequence.
         """
-        self.previous[env_indices] = self.state[env_indices]
+        self.previous[env_indices] = self.state.take(env_indices)
         if self.pending.shape[1] > 1:
             self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
         self.pending[env_indices, -1] = actions

@@ -196,7 +196,7 @@ class TermScores:
 
     def means_of(self, states: np.ndarray) -> CodeMeans:
         """`measured`, to be filled when frames of clean sources are recorded at `states` (B,)."""
-        return CodeMeans.empty(self._packed, self._which[states])
+        return CodeMeans.empty(self._packed, self._which.take(states))
 
     def expected(
         self,

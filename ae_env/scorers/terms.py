@@ -386,20 +386,23 @@ class Balanced(CompositeScorer):
             left = [1.0 - (torch.log(scores[name]) * faults[name]) ** 4 for name in faults]
             factors: Any = [*(share.clamp(min=0.0) for share in left), *map(pow, values, weights)]
             return math.prod(factors)
-        columns = np.array(values, np.float64)
-        totals = np.empty(columns.shape[1:])
-        fixed = np.array(weights), np.array([*faults.values()])
+        try:
+            columns = np.array(values, np.float64)
+        except ValueError:  # of different shapes
+            columns = np.array(np.broadcast_arrays(*values), np.float64)
+        totals, rows = np.empty(columns.shape[1:]), [[*self.weights].index(name) for name in faults]
+        fixed = np.array(weights), np.array(rows), np.array([*faults.values()])
         _balance(columns.reshape(len(columns), -1), *fixed, totals.reshape(-1))
         return totals[()]
 
 
 @kernel()
-def _balance(scores, weights, scales, totals):  # type: ignore[no-untyped-def]
-    """`Balanced.combine` of `scores` (5, N), whose shares of faults have these `scales` (2,)."""
+def _balance(scores, weights, faults, scales, totals):  # type: ignore[no-untyped-def]
+    """`Balanced.combine` of `scores` (K, N); shares of the two `faults` have these `scales`."""
     for i in range(len(totals)):
         total = 1.0
         for fault in range(2):
-            left = 1.0 - (scales[fault] * math.log(scores[1 + fault, i])) ** 4
+            left = 1.0 - (scales[fault] * math.log(scores[faults[fault], i])) ** 4
             total *= 0.0 if left < 0.0 else left  # rounding may leave a share above 1
         for part in range(len(weights)):
             total *= scores[part, i] ** weights[part]

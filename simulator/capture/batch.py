@@ -167,7 +167,7 @@ class CaptureBatch:
         """
         rows = indices * len(self.states) + states
         self._finish()
-        if np.count_nonzero(stale := self._gain[rows] != gains):
+        if np.count_nonzero(stale := self._gain.take(rows) != gains):
             self._plan(indices[stale], rows[stale], gains[stale])
         self._make_light(indices, rows)
 
@@ -198,7 +198,7 @@ class CaptureBatch:
         remaining = None
         if self._noises is not None and (shares := self._share[rows]).any():
             remaining = blurred_frames.FramesAt(shares, self._size)
-        light = self._frames.at(self._blurred[rows])
+        light = self._frames.at(self._blurred.take(rows))
         found = Transitions(light, self._table.take(rows, axis=0), remaining)
         if not self.camera.prnu or self.noise is None:
             return found
@@ -258,9 +258,9 @@ class CaptureBatch:
         return FrameStatistics(
             clipped_low=shares[:, 0],
             clipped_high=shares[:, 1],
-            excess_variance=self._excess_variance[rows],
-            predicted_error=self._predicted_error[rows],
-            modules=self._modules[rows],
+            excess_variance=self._excess_variance.take(rows),
+            predicted_error=self._predicted_error.take(rows),
+            modules=self._modules.take(rows),
             source_noise=source_noise,
             keys=keys,
         )
@@ -407,11 +407,11 @@ class CaptureBatch:
         if not len(missing):
             return
         with self._forgetting(indices):
-            indices, rows, light = indices[missing], rows[missing], source[missing]
+            indices, rows, light = (each.take(missing) for each in (indices, rows, source))
             if np.count_nonzero(opened := light == 0):
                 light[opened] = self._frames.places(self._open(rows[opened]))
-            slots, blurs = self._slots[rows - indices * len(self.states)], self._blur.take(rows)
-            rest = self._rest[indices]
+            slots, blurs = self._slots.take(rows % len(self.states)), self._blur.take(rows)
+            rest = self._rest.take(indices)
             owners = np.where(light == self._place[rest, 0], rest, self.num_scenes + indices)
             self._blurred[rows], planned = self._frames.plan(indices, slots, blurs, light, owners)
             # Wide discs, which no kernel makes, and those that blends of several frames wait for.

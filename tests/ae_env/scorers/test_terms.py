@@ -18,7 +18,7 @@ from ae_env.scorers import CompositeScorer, make_scorer
 from ae_env.scorers.captures import SceneCaptures, prepare_scene, source_noises
 from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.term_scores import TermScores
-from ae_env.scorers.terms import Highlights, Noise, Sharpness
+from ae_env.scorers.terms import Balanced, Highlights, Noise, Shadows, Sharpness
 from simulator import NoiseLevelFunction
 from simulator.capture.blurred_frames import Layout
 from simulator.capture.sensor import clip_and_quantise
@@ -89,6 +89,22 @@ def test_scores_follow_the_formulas(illuminance, speed, defocus):
         assert scores.dtype == torch.float64
         wanted = [scores_of_state[name] for scores_of_state in expected]
         np.testing.assert_allclose(scores.numpy(), wanted, rtol=2e-4, atol=1e-6, err_msg=name)
+
+
+class Faults(Balanced):
+    """`Balanced` of both faults alone, in another order."""
+
+    def __init__(self):
+        CompositeScorer.__init__(self, {"shadows": Shadows(), "highlights": Highlights()})
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor, float])
+def test_balanced_finds_its_faults_by_name(kind):
+    scores = {"highlights": 0.3, "shadows": 0.6}
+    shares = -0.15 * math.log(0.3), -0.2 * math.log(0.6)
+    expected = math.prod(1 - share**4 for share in shares) * math.sqrt(0.3 * 0.6)
+    found = Faults().combine({name: kind(score) for name, score in scores.items()})
+    assert float(found) == pytest.approx(expected, rel=1e-6)
 
 
 def test_noise_is_that_of_the_cameras_own_pixels() -> None:
