@@ -14,7 +14,7 @@ PACKAGES = ("simulator", "ae_env", "agents")
 MAX_LINES, MAX_MODULES, MAX_FUNCTION, MAX_FOLDER = 42_668, 145, 60, 15
 #: Kernels whose inner calls would cost time (a tenth of a recorded frame), and their lines.
 LONGER = {"simulator.capture.sensor.record_units": 69}
-MAX_LINES_OF = {"benchmarks": 7_200, "tests": 20_650}
+MAX_LINES_OF = {"benchmarks": 7_200, "tests": 20_652}
 
 
 def module_name(path: Path) -> str:

@@ -92,7 +92,7 @@ class AutoExposure(Task):
         self._light_scores = np.full((len(self._of_light), len(episodes.scenes), states), np.nan)
         self._unlit = len(episodes.scenes)  # of how many scenes they are not
         self._sharp = terms.only_sharpness
-        # Whether these are looked up or in closed form, and worth no memory: episodes differ.
+        # Whether these are cheap to work out, and differ from episode to episode: none is kept.
         direct = len(self._of_light) + len(self._sharp) == len(self._known)
         self._fleeting = direct and not episodes.at_rest
         self._means = options.placed(np.zeros((lights, states, 3) if expected else 0))

@@ -207,7 +207,7 @@ class Episodes:
         for i, one in enumerate(chosen):
             state[i] = one.get("state", state[i])
         drawn = np.stack([defocus, speed, subject_speed, turn])
-        drawn = 0.0 * drawn if self.at_rest else normals_above(drawn)
+        drawn = 0.0 * drawn if self.at_rest else normals_above(drawn)  # at rest none is used
         discs = np.exp(DEFOCUS_SIGMA * drawn[0]) * DEFOCUS_MEDIAN
         discs = np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
         discs = _fixed_or_drawn(self.options.depth, discs)

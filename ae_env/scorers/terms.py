@@ -386,7 +386,7 @@ class Balanced(CompositeScorer):
             left = [1.0 - (torch.log(scores[name]) * faults[name]) ** 4 for name in faults]
             factors: Any = [*(share.clamp(min=0.0) for share in left), *map(pow, values, weights)]
             return math.prod(factors)
-        try:
+        try:  # arrays without torch, whose threads do not survive a fork
             columns = np.array(values, np.float64)
         except ValueError:  # of different shapes
             columns = np.array(np.broadcast_arrays(*values), np.float64)

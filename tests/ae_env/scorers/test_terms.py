@@ -105,6 +105,8 @@ def test_balanced_finds_its_faults_by_name(kind):
     expected = math.prod(1 - share**4 for share in shares) * math.sqrt(0.3 * 0.6)
     found = Faults().combine({name: kind(score) for name, score in scores.items()})
     assert float(found) == pytest.approx(expected, rel=1e-6)
+    found = Faults().combine(scores | {"shadows": np.full((2, 3), 0.6)})  # of different shapes
+    np.testing.assert_allclose(found, np.full((2, 3), expected), rtol=1e-12)
 
 
 def test_noise_is_that_of_the_cameras_own_pixels() -> None:
