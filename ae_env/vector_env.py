@@ -218,18 +218,20 @@ class AutoExposureVectorEnv(
         """Info columns of `env_indices` in the layout of Gymnasium's vector environments.
 
         Every column has one entry per environment, 0 for those that are not in `env_indices`, and
-        a mask beside it.
+        a mask beside it, the same read-only one for all.
         """
         placed, partial = self.core.options.placed, len(env_indices) < self.num_envs
-        masks = np.full((len(columns), self.num_envs), not partial)
+        mask = np.full(self.num_envs, not partial)
         if partial:
-            masks[:, env_indices] = True
+            mask[env_indices] = True
             columns = dict(columns)
             for name, some in columns.items():
                 made: Any = torch.zeros if torch.is_tensor(some) else np.zeros
                 columns[name] = placed(made((self.num_envs, *some.shape[1:]), dtype=some.dtype))
                 columns[name][env_indices] = some
-        return columns | {f"_{n}": mask for n, mask in zip(columns, placed(masks), strict=True)}
+        shared = dict.fromkeys([f"_{name}" for name in columns], placed(mask))
+        mask.setflags(write=False)
+        return columns | shared
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:

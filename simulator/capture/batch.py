@@ -273,7 +273,9 @@ class CaptureBatch:
             self._pending = None
             order = np.empty(len(planned.passes) + len(indices), np.int64)
             counter, ends = np.zeros(1, np.int64), np.zeros(len(indices) + 1, np.int64)
-            deal_out(planned.passes, indices, self.num_scenes, order, ends)
+            # Light and discs of a scene stay in caches from one of its episodes to the next.
+            turns = np.argsort(np.append(self._rest, self._rest.take(indices)), kind="stable")
+            deal_out(planned.passes, indices, turns, order, ends)
             given = order, ends, units, (1, *planned), fixed
             parallel_ranges(lambda *_: photograph(counter, *given), torch.get_num_threads())
 
@@ -479,27 +481,28 @@ def photograph(counter, order, ends, units, blurring, recording):  # type: ignor
 
 
 @kernel()
-def deal_out(passes, scenes, num_scenes, order, ends):  # type: ignore[no-untyped-def]
+def deal_out(passes, scenes, turns, order, ends):  # type: ignore[no-untyped-def]
     """Puts passes (J,), and behind them frames of `scenes` (B,), in `order` (J + B,).
 
-    They come scene by scene, the costly ones first, the passes of a scene before its frames. `ends`
-    (B + 1,), zeros, get where each scene begins and the last ends; the length where there are less.
+    They come scene by scene, the costly ones first, else in `turns`, which also have each frame as
+    another scene; the passes of a scene before its frames. `ends` (B + 1,), zeros, get where each
+    scene begins and the last ends; the length where there are less.
     """
-    owner, total = np.empty(len(order), np.int64), num_scenes + len(scenes)
+    owner, total = np.empty(len(order), np.int64), len(turns)
     cost, counts, spent = np.zeros(total), np.zeros(total, np.int64), 0.0
     for unit in range(len(order)):
         k = unit - len(passes)
         if k < 0:
             one, more = passes[unit].scene, passes[unit].cost
         else:  # a frame without passes can be anywhere
-            one, more = scenes[k] if counts[scenes[k]] else num_scenes + k, RECORDING
+            one, more = scenes[k] if counts[scenes[k]] else total - len(scenes) + k, RECORDING
         owner[unit] = one
         counts[one] += 1
         cost[one] += more
         spent += more
     begin, done, number = np.empty(total, np.int64), 0, 0
     for cheap in range(2):
-        for one in range(total):
+        for one in turns:
             if counts[one] and cheap == (cost[one] * len(scenes) < spent):
                 begin[one] = done
                 done += counts[one]

@@ -240,7 +240,7 @@ def record(
         noises = keys, noise, read_noise
         return _record_stepwise(transitions, camera, noises, row_gain, tensors, count)
     light, remaining, read = transitions.light, transitions.remaining_variance, None
-    frames, samples = len(light), math.prod(transitions.shape[1:])
+    frames, samples, places = len(light), math.prod(transitions.shape[1:]), addresses(light)
     pieces = -(-samples // (BLOCK * _UNIT_BLOCKS))
     counts = np.zeros((frames, 2))
     shares = np.zeros(frames, np.uintp) if remaining is None else addresses(remaining)
@@ -254,9 +254,10 @@ def record(
         arrays[name].reshape(frames, 4, samples) if name in arrays else np.empty((0, 4, 0), dtype)
         for name, dtype in _KINDS.items()
     )
+    turns = np.arange(frames) if run else places.argsort(kind="stable")  # light stays in caches
     fixed = (
         samples,
-        (addresses(light), shares, transitions.table),
+        (places, shares, transitions.table, turns),
         (_NO_KEYS, _NO_BANK) if keys is None else (keys, _NO_BANK if drawn else noise_bank()),
         camera.digits,
         (codes, numbers, tuple(signals), counts if count else counts[:0]),
@@ -264,9 +265,8 @@ def record(
     # Means come with the frames where none of these is to be divided.
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     size = 4 * pieces if least >= 4 * pieces or frames >= 2 * torch.get_num_threads() else 1
-    gains = None if row_gain is None else row_gain.astype(np.float32)
     filled = tuple(_NO_MEANS if means is None or size == 1 else means)
-    whole = *fixed, filled, drawn, read, gains
+    whole = *fixed, filled, drawn, read, None if row_gain is None else row_gain.astype(np.float32)
     if run is None:
         parallel_ranges(
             lambda first, last: record_units(first * size, last * size, *whole),
@@ -611,14 +611,14 @@ def record_units(  # type: ignore[no-untyped-def]
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order.
 
-    Of `scenes` there are addresses of light and of shares of variance, and the table of
-    `Transitions`; of `noise` keys and the bank. What is None is not compiled: whether noise is
-    `drawn`, what `read` noise with rows and tails is drawn by, and the `gains` (B, H) of rows.
-    Where there are `means` (of `CodeMeans`) to fill, frames are not divided.
+    Of `scenes` there are addresses of light and of shares of variance, the table of `Transitions`,
+    and the order of the frames; of `noise` keys and the bank. What is None is not compiled: whether
+    noise is `drawn`, what `read` noise with rows and tails is drawn by, and the `gains` (B, H) of
+    rows. Where there are `means` (of `CodeMeans`) to fill, frames are not divided.
 
     It is one function: calls with arrays in tuples, once a block, take a tenth of its time.
     """
-    (light, remaining, exposure), (keys, bank) = scenes, noise
+    (light, remaining, exposure, turns), (keys, bank) = scenes, noise
     codes, numbers, signals, counts = outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     lit, varied = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -630,7 +630,7 @@ def record_units(  # type: ignore[no-untyped-def]
     blocks = (samples + BLOCK - 1) // BLOCK
     pieces = (blocks + _UNIT_BLOCKS - 1) // _UNIT_BLOCKS
     for unit in range(first, last):
-        frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
+        frame, plane, piece = turns[unit // (4 * pieces)], (unit // pieces) % 4, unit % pieces
         ratio, shot, dark, source_shot, source_read = exposure[frame, :, plane]
         span, black, low, high, white, rounding = sensor[:, plane]
         body, dark = (span, black, white), dark - rounding
