@@ -49,6 +49,8 @@ MOST_WHITE = 16.0
 #: its centre is from the sample's row and column [packed pixel]. A quarter tells of noise where it
 #: has so many samples that were measured near white, within so many deviations.
 _QUARTERS, _ENOUGH, _NEAR_DEVIATIONS = ((3, 2), (9, 4), (21, 10)), 3.0, 3.0
+#: Planes of up to so many pixels are looked at together.
+_SMALL_PX = 2**16
 
 Gains = torch.Tensor | np.ndarray | Sequence[float]
 Matrix = torch.Tensor | np.ndarray | Sequence[Sequence[float]]
@@ -425,20 +427,22 @@ def _clipped_by_noise(
     light, trust = torch.zeros(2, *data.shape, device=data.device)
     if raw.nlf is None and not raw.camera.nlf_by_iso:
         return light, trust
-    variances = zip(raw.noise.shot, raw.noise.read, strict=True)
-    for plane, (shot, read) in enumerate(variances):  # one at a time, which takes less memory
-        own = np.s_[plane : plane + 1]
-        deviation = math.sqrt(max(shot + read, 0.0))
-        light[own], trust[own] = _told_by_neighbours(data[own], full[own], deviation)
+    variances = np.add(raw.noise.shot, raw.noise.read).clip(0.0)
+    deviations = torch.from_numpy(np.sqrt(variances)[:, None, None])
+    step = 4 if full[0].numel() <= _SMALL_PX else 1  # one plane at a time takes less memory
+    for first in range(0, 4, step):
+        own = np.s_[first : first + step]
+        light[own], trust[own] = _told_by_neighbours(data[own], full[own], deviations[own])
     return light, trust
 
 
 def _told_by_neighbours(
-    data: torch.Tensor, full: torch.Tensor, deviation: float
+    data: torch.Tensor, full: torch.Tensor, deviations: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of one plane (1, H, W), see `_clipped_by_noise`."""
+    """Of planes (P, H, W) whose noise has these deviations (P, 1, 1), see `_clipped_by_noise`."""
     light, trust = torch.zeros(2, *data.shape, device=data.device)
-    near, unseen = (data >= 1.0 - _NEAR_DEVIATIONS * deviation) & ~full, full
+    bound = (1.0 - _NEAR_DEVIATIONS * deviations).to(data)
+    near, unseen = (data >= bound) & ~full, full
     for side, apart in _QUARTERS:
         if not bool(unseen.any()):
             break
@@ -448,7 +452,7 @@ def _told_by_neighbours(
         others, enough = 1.0 - at_white - below, (least * side**2 / _ENOUGH).clamp(max=1.0)
         better = unseen & (enough > trust) & (others < below)
         share = at_white / (at_white + below).clamp(min=0.5 / side**2)
-        above = (deviation * torch.special.ndtri(share)).clamp(min=0.0)
+        above = (deviations.to(data) * torch.special.ndtri(share)).clamp(min=0.0)
         light = torch.where(better, 1.0 + above, light)
         trust = torch.where(better, enough, trust)
         unseen = unseen & (trust < 1.0) & (others <= below + 1e-4)
