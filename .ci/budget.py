@@ -11,10 +11,10 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Packages in the order of their layers: each imports those before it only.
 PACKAGES = ("simulator", "ae_env", "agents")
 #: A function is counted without its docstring.
-MAX_LINES, MAX_MODULES, MAX_FUNCTION, MAX_FOLDER = 42_684, 145, 60, 15
+MAX_LINES, MAX_MODULES, MAX_FUNCTION, MAX_FOLDER = 42_677, 145, 60, 15
 #: Kernels whose inner calls would cost time (a tenth of a recorded frame), and their lines.
 LONGER = {"simulator.capture.sensor.record_units": 69}
-MAX_LINES_OF = {"benchmarks": 7_200, "tests": 20_652}
+MAX_LINES_OF = {"benchmarks": 7_200, "tests": 20_657}
 
 
 def module_name(path: Path) -> str:

@@ -380,27 +380,20 @@ class Balanced(CompositeScorer):
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total of the parts' `scores`: tensors, arrays of any one shape, or numbers."""
-        values, (weights, rows, scales) = [scores[name] for name in self.weights], self._factors
+        values, weights = [scores[name] for name in self.weights], [*self.weights.values()]
+        faults = {name: self.parts[name].scale for name in ("highlights", "shadows")}  # type: ignore[attr-defined]
         if any(map(torch.is_tensor, values)):
-            faults = zip(rows.tolist(), scales.tolist(), strict=True)
-            left = [1.0 - (torch.log(values[row]) * scale) ** 4 for row, scale in faults]
-            powers = map(pow, values, weights.tolist())
-            return math.prod([*(share.clamp(min=0.0) for share in left), *powers])
+            left = [1.0 - (torch.log(scores[name]) * faults[name]) ** 4 for name in faults]
+            factors: Any = [*(share.clamp(min=0.0) for share in left), *map(pow, values, weights)]
+            return math.prod(factors)
         try:  # arrays without torch, whose threads do not survive a fork
             columns = np.array(values, np.float64)
         except ValueError:  # of different shapes
             columns = np.array(np.broadcast_arrays(*values), np.float64)
-        totals = np.empty(columns.shape[1:])
-        _balance(columns.reshape(len(columns), -1), weights, rows, scales, totals.reshape(-1))
+        totals, rows = np.empty(columns.shape[1:]), [[*self.weights].index(name) for name in faults]
+        fixed = np.array(weights), np.array(rows), np.array([*faults.values()])
+        _balance(columns.reshape(len(columns), -1), *fixed, totals.reshape(-1))
         return totals[()]
-
-    @cached_property
-    def _factors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Weights; which of them are those of the two faults; and the scales of these."""
-        faults = "highlights", "shadows"
-        scales: Any = [self.parts[name].scale for name in faults]  # type: ignore[attr-defined]
-        rows = np.array([[*self.weights].index(name) for name in faults])
-        return np.array([*self.weights.values()]), rows, np.array(scales)
 
 
 @kernel()

@@ -441,7 +441,7 @@ def _told_by_neighbours(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Of planes (P, H, W) whose noise has these deviations (P, 1, 1), see `_clipped_by_noise`."""
     light, trust = torch.zeros(2, *data.shape, device=data.device)
-    bound = (1.0 - _NEAR_DEVIATIONS * deviations).to(data)
+    bound, deviations = (1.0 - _NEAR_DEVIATIONS * deviations).to(data), deviations.to(data)
     near, unseen = (data >= bound) & ~full, full
     for side, apart in _QUARTERS:
         if not bool(unseen.any()):
@@ -452,7 +452,7 @@ def _told_by_neighbours(
         others, enough = 1.0 - at_white - below, (least * side**2 / _ENOUGH).clamp(max=1.0)
         better = unseen & (enough > trust) & (others < below)
         share = at_white / (at_white + below).clamp(min=0.5 / side**2)
-        above = (deviations.to(data) * torch.special.ndtri(share)).clamp(min=0.0)
+        above = (deviations * torch.special.ndtri(share)).clamp(min=0.0)
         light = torch.where(better, 1.0 + above, light)
         trust = torch.where(better, enough, trust)
         unseen = unseen & (trust < 1.0) & (others <= below + 1e-4)

@@ -451,7 +451,7 @@ def test_clipped_planes_become_as_bright_as_white(recorded, expected) -> None:
     "light",
     [*((v,) * 4 for v in (0.92, 0.97, 1.0, 1.02, 1.06)), (1.0, 2.0, 2.0, 4 / 3)],
 )
-def test_what_noise_alone_clips_stays_near_white(light: tuple[float, ...]) -> None:
+def test_what_noise_alone_clips_stays_near_white(light: tuple[float, ...], monkeypatch) -> None:
     """A flat patch at ISO 6400: nothing measured is replaced, and the rest is off by the noise."""
     deviation, true = 0.03, torch.tensor(light)[:, None, None]
     nlf = NoiseLevelFunction((deviation**2,) * 4, (0.0,) * 4)
@@ -464,6 +464,11 @@ def test_what_noise_alone_clips_stays_near_white(light: tuple[float, ...]) -> No
     assert (found >= recorded).all()
     inner = found[:, 3:-3, 3:-3] / true
     assert (inner - 1.0).square().mean().sqrt() < 1.1 * deviation
+    # Planes of a large raw are looked at one by one, each with the noise of its own.
+    raw = replace(raw, nlf=NoiseLevelFunction((1e-4, 4e-4, 9e-4, 16e-4), (0.0,) * 4))
+    together = neutral_highlights(raw, raw.saturated)
+    monkeypatch.setattr(developing, "_SMALL_PX", 0)
+    assert neutral_highlights(raw, raw.saturated).equal(together)
 
 
 def test_full_below_white_an_absurd_balance_and_one_measured_sample() -> None:
