@@ -77,9 +77,9 @@ def main(size=64, num_envs=64, *, cached=False):
     torch.set_num_threads(1)
     options = {"scenes": "bundled:small", "resolution": size, "autoreset_mode": "SAME_STEP"}
     options |= {"motion": "none", "depth": "far"} if cached else {}
-    lights = np.random.default_rng(0).random((8, 4, size, size), np.float32)
-    kernel = KernelLimit(lights, num_envs, noise="bank", seed=0)
     envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=num_envs, **options)
+    lights = np.stack([scene.light.numpy() for scene in envs.unwrapped.scenes])
+    kernel = KernelLimit(lights, num_envs, noise="bank", seed=0)
     envs.reset(seed=0)
     actions = np.random.default_rng(0).integers(0, 64, (100 + ROUNDS * STEPS, num_envs))
     for chosen in actions[:100]:
